@@ -1,0 +1,69 @@
+# Everything that a person or a machine does here; `make help` explains each target.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/ready
+
+STUDY ?= demo/studies-$(SEED)/patient-0001
+OUT ?= demo/products-$(SEED)
+STUDIES ?= demo/studies-$(SEED)
+CONFIG ?= configs/default.yaml
+WORKERS ?= 2
+SEED ?= 1
+
+STAGES := ingest segment surface register bake evaluate report
+
+.PHONY: help setup demo test check lint types bench train batch clean $(STAGES)
+
+help: ## explain every target
+	@sed -n 's/^\([a-z][a-z |]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{printf "%-10s %s\n", $$1, $$2}'
+	@echo "$(STAGES):"
+	@echo "           one stage, those before it brought up to date: make segment STUDY=... OUT=... CONFIG=..."
+
+setup: $(READY) ## make .venv with the tested versions of everything (a minute or two)
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+demo: $(STUDY)/study.yaml ## a synthetic patient becomes a force field, with a report at the end (SEED=1)
+	$(BIN)/beatfield run $(STUDY) --out $(OUT) --config $(CONFIG) | tee $(OUT).txt
+	@sed -n 's/^query  *beatfield //p' $(OUT).txt | xargs $(BIN)/beatfield
+
+demo/studies-$(SEED)/patient-0001/study.yaml: $(READY)
+	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite
+
+test: setup ## run all tests
+	$(BIN)/pytest -n 2 --dist worksteal -q
+
+check: lint types test ## all that CI runs: lint, types, test
+
+lint: setup ## formatting and lint
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: setup ## static types
+	$(BIN)/mypy
+
+bench: setup ## speed beside peers, as ratios in one run
+	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
+
+train: setup ## make the segmentation weights anew from the phantom (an hour or so; needs PyTorch)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
+	$(BIN)/python -m data_synth.training --out training
+
+$(STAGES): setup
+	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)
+
+batch: setup ## run a folder of studies: make batch STUDIES=... OUT=... WORKERS=2
+	$(BIN)/beatfield batch $(STUDIES) --out $(OUT) --workers $(WORKERS) --config $(CONFIG)
+
+clean: ## remove the demo, caches and the virtual environment
+	rm -rf demo training $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

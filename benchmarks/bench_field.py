@@ -1,0 +1,121 @@
+"""Baking and asking a field, beside peers in one run: a group's table gives the ratios."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista
+from pytest_benchmark.fixture import BenchmarkFixture
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
+
+from pipeline.field import BakeSettings, ForceField
+from pipeline.field.bake import bake_field
+from pipeline.field.certificate import vtk_distance
+from pipeline.field.distance import node_axes, signed_distance
+from pipeline.field.fixture import DEFAULT_FIXTURES
+from pipeline.geometry import Float, Grid, MovingSurface, Surface
+
+# VTK would need minutes for the whole grid: it gets every 64th node, so its ratio is 64 times
+# what the table says.
+VTK_SHARE = 64
+QUERY_POINTS = 100_000
+
+
+def heart_like(level: int) -> Surface:
+    """An uneven ball of about 100 mm: 20 * 4^level triangles."""
+    ball = pyvista.Icosphere(radius=1.0, nsub=level)
+    unit = np.asarray(ball.points, dtype=float)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    bumps = 1 + 0.08 * np.sin(5 * unit[:, 0] + 1) * np.cos(4 * unit[:, 1]) * np.sin(6 * unit[:, 2])
+    vertices = 45 * unit * bumps[:, None] * (0.8, 0.9, 1.1)
+    return Surface(vertices, np.asarray(ball.regular_faces, dtype=np.int64))
+
+
+def bake_study(folder: Path, phase_count: int) -> ForceField:
+    """Two structures, three fixtures, the default settings."""
+    phases = np.arange(phase_count) / phase_count
+    size = 1 - 0.08 * np.sin(np.pi * phases)[:, None, None] ** 2
+    large, small = heart_like(5), heart_like(4)
+    atrium = 0.5 * small.vertices_mm * size + (10, 20, 40)
+    surfaces = {
+        "epicardium": MovingSurface(large.vertices_mm * size, large.triangles, phases),
+        "left_atrium": MovingSurface(atrium, small.triangles, phases),
+    }
+    bake_field(folder, surfaces, DEFAULT_FIXTURES, BakeSettings(), rr_s=0.8)
+    return ForceField.open(folder)
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> ForceField:
+    """Three phases of the study."""
+    return bake_study(tmp_path_factory.mktemp("bench") / "field.zarr", 3)
+
+
+# 5k triangles: the tree is small; 20k: a heart of 2 mm edges; 80k: one of 1 mm.
+@pytest.mark.parametrize("level", [4, 5, 6])
+@pytest.mark.parametrize("who", ["ours", f"VTK, one node in {VTK_SHARE}"])
+def test_mesh_to_grid(benchmark: BenchmarkFixture, who: str, level: int) -> None:
+    """Exact signed distance on 80 x 80 x 90 nodes."""
+    surface = heart_like(level)
+    benchmark.group = f"mesh of {len(surface.triangles)} triangles to 576,000 nodes"
+    grid = Grid((90, 80, 80), (-50.0, -52.0, -60.0), (1.25, 1.3, 1.35))
+    some = grid.nodes_mm().reshape(-1, 3)[::VTK_SHARE]
+    ours = benchmark.pedantic(
+        (lambda: signed_distance(surface, grid).ravel()[::VTK_SHARE])
+        if who == "ours"
+        else (lambda: vtk_distance(surface, some)),
+        rounds=3,
+        warmup_rounds=1,
+    )
+    assert np.isfinite(ours).all()
+
+
+def test_bake(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+    """The default study: 25 phases, two structures, three fixtures, certified and sealed."""
+    benchmark.group = "bake"
+    field = benchmark.pedantic(bake_study, args=(tmp_path / "field.zarr", 25), rounds=1)
+    assert field.accuracy["sign_errors"] == 0
+    benchmark.extra_info |= {"accuracy": field.accuracy, "grid": field.grid.shape}
+
+
+def questions(field: ForceField) -> dict[str, Callable[[], Float]]:
+    """Ours in 4D; SciPy's answers are one phase's distance only, without gradient."""
+    grid, rng = field.grid, np.random.default_rng(0)
+    inner = np.array(grid.spacing_mm)
+    points: Float = rng.uniform(grid.origin_mm + inner, grid.upper_mm - inner, (QUERY_POINTS, 3))
+    volume = field.stored_distance_mm("epicardium", 1)
+    linear = RegularGridInterpolator(node_axes(grid)[::-1], volume)
+    places = ((points - grid.origin_mm) / grid.spacing_mm).T[::-1]
+    return {
+        "force, ours": lambda: field.force_n(points, 0.13),
+        "distance and gradient, ours": lambda: field.gradient(points, 0.13),
+        "distance, map_coordinates": lambda: map_coordinates(
+            volume, places, order=3, prefilter=False
+        ),
+        "distance, RegularGridInterpolator": lambda: linear(points[:, ::-1]),
+    }
+
+
+@pytest.mark.parametrize(
+    "who",
+    [
+        "force, ours",
+        "distance and gradient, ours",
+        "distance, map_coordinates",
+        "distance, RegularGridInterpolator",
+    ],
+)
+def test_batch(benchmark: BenchmarkFixture, field: ForceField, who: str) -> None:
+    """100,000 random points."""
+    benchmark.group = f"{QUERY_POINTS} random points"
+    assert np.isfinite(benchmark(questions(field)[who])).all()
+
+
+def test_single_point(benchmark: BenchmarkFixture, field: ForceField) -> None:
+    """What a loop in Python pays for one force."""
+    benchmark.group = "one point a call"
+    assert np.isfinite(benchmark(field.force_n, np.array([[10.0, 20.0, 30.0]]), 0.13)).all()

@@ -1,0 +1,96 @@
+"""``python -m data_synth OUT``: make synthetic patient studies."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+QUIET_S = 2.0
+"""Work shorter than this shows no progress."""
+REFRESH_S = 0.5
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code: 0 done, 2 the command or the settings are wrong."""
+    options = _parser().parse_args(arguments)
+    from data_synth.errors import SynthError
+
+    try:
+        _write_patients(options)
+    except SynthError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return SynthError.exit_code
+    return 0
+
+
+def _write_patients(options: argparse.Namespace) -> None:
+    from data_synth.errors import SynthError
+    from data_synth.settings import read_settings
+    from data_synth.study import require_free, write_study
+
+    if options.patients < 1:
+        raise SynthError(f"--patients is {options.patients}; give 1 or more")
+    first = read_settings(options.config, _changes(options))
+    patients = [
+        first.model_copy(update={"seed": first.seed + k, "patient_id": f"patient-{k + 1:04d}"})
+        for k in range(options.patients)
+    ]
+    for settings in patients:
+        require_free(options.out / settings.patient_id, options.overwrite)
+    for settings in patients:
+        folder = options.out / settings.patient_id
+        line = ProgressLine(settings.patient_id)
+        try:
+            write_study(folder, settings, line, options.overwrite)
+        finally:
+            line.end()
+        sys.stdout.write(f"{folder}\n")
+
+
+def _changes(options: argparse.Namespace) -> dict[str, Any]:
+    given = {"seed": options.seed, "cine": options.cine, "cine_only": options.cine_only or None}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m data_synth", description="Make synthetic patient studies with known truth."
+    )
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="folder to write patient-0001/ ... in"
+    )
+    parser.add_argument("--seed", type=int, help="patient number k has seed N + k - 1 (default 1)")
+    parser.add_argument("--patients", type=int, default=1, metavar="N", help="how many (default 1)")
+    parser.add_argument("--config", type=Path, metavar="YAML", help="settings of the phantom")
+    parser.add_argument("--cine", choices=["dicom", "nifti"], help="format of the cine")
+    parser.add_argument("--cine-only", action="store_true", help="leave out ECG and ultrasound")
+    parser.add_argument("--overwrite", action="store_true", help="replace studies that exist")
+    return parser
+
+
+class ProgressLine:
+    """One line on standard error that keeps up with work of more than two seconds."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.shown = name, False
+        self.next = time.monotonic() + QUIET_S
+
+    def __call__(self, done: int, total: int) -> None:
+        """Tell how far the work has come."""
+        if time.monotonic() > self.next:
+            self.shown, self.next = True, time.monotonic() + REFRESH_S
+            sys.stderr.write(f"\r{self.name}: {100 * done // total:3d} %")
+            sys.stderr.flush()
+
+    def end(self) -> None:
+        """Leave the line behind."""
+        if self.shown:
+            sys.stderr.write("\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

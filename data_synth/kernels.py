@@ -1,0 +1,120 @@
+"""The one door to compiled code, and the values that compiled code reads."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple, ParamSpec, TypeVar, cast
+
+import numpy as np
+import numpy.typing as npt
+from numba import config, njit
+
+Float = npt.NDArray[np.float64]
+Label = npt.NDArray[np.uint8]
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a numeric function to machine code; the result is kept on disk between runs.
+
+    The compiler looks at a function's own file alone to tell whether its stored code still holds,
+    not at those of the functions it calls. So the folder is named by the sources of all.
+    """
+    usual = config.CACHE_DIR
+    config.CACHE_DIR = str(Path(usual or Path(__file__).parent / "__pycache__") / _digest())
+    try:
+        return cast("Callable[Parameters, Result]", njit(cache=True)(function))
+    finally:
+        config.CACHE_DIR = usual
+
+
+@cache
+def _digest() -> str:
+    names = ("kernels", "profiles", "motion", "anatomy", "thorax")
+    sources = [Path(__file__).with_name(f"{name}.py").read_bytes() for name in names]
+    return "numba-" + hashlib.sha256(b"".join(sources)).hexdigest()[:12]
+
+
+class Shape(NamedTuple):
+    """Sizes of one heart at the R peak, in its own frame (mm, radians).
+
+    Origin: centre of the mitral plane. z: from apex to base. x: towards the right ventricle.
+    y = z cross x: towards the anterior wall.
+    """
+
+    lv_radius: float = 27.5
+    """Largest radius of the left-ventricular cavity."""
+    lv_length: float = 90.0
+    """Apex of the cavity to the mitral plane."""
+    lv_widest: float = 0.3
+    """Where the cavity is widest, as a share of its length below the mitral plane."""
+    lv_narrowing: float = 0.14
+    """Loss of squared radius from the widest place to the mitral plane."""
+    lv_wall: float = 9.0
+    apex_wall: float = 5.5
+    rv_width: float = 33.0
+    """Largest distance from the septum to the free wall."""
+    rv_half_angle: float = 1.35
+    """Half of the angle that the right ventricle embraces."""
+    rv_angle: float = -0.05
+    """Direction of its middle, from +x towards +y."""
+    rv_reach: float = 0.9
+    """Its apex, as a share of the left cavity's length."""
+    rv_wall: float = 3.0
+    la_x: float = -10.0
+    la_y: float = -10.0
+    la_z: float = 21.0
+    la_radius_x: float = 22.0
+    la_radius_y: float = 19.5
+    la_radius_z: float = 21.0
+    ra_x: float = 46.0
+    ra_y: float = -16.0
+    ra_z: float = 20.0
+    ra_radius_x: float = 22.0
+    ra_radius_y: float = 22.0
+    ra_radius_z: float = 25.0
+    mitral_radius: float = 15.0
+    tricuspid_radius: float = 16.5
+    atrial_wall: float = 2.0
+    aorta_radius: float = 13.5
+    appendage_length: float = 1.0
+    """Scale of the finger-like appendage of the left atrium; 1 is about 50 mm along the bend."""
+    appendage_radius: float = 8.0
+    fat_depth: float = 3.0
+    """Fat over the outer surface; the grooves hold more."""
+
+
+class Tubes(NamedTuple):
+    """Centre lines with radii, ``(n, 4)`` rows of x, y, z, radius in the heart frame."""
+
+    aorta: Float
+    outflow: Float
+    pulmonary: Float
+    appendage: Float
+    cava: Float
+
+
+class Beat(NamedTuple):
+    """How much each part has moved at one instant; all zero at the R peak."""
+
+    lv: float
+    """Share of squared cavity radius lost by radial contraction."""
+    rv: float
+    """Share of the right ventricle's cross-section lost."""
+    descent_lv: float
+    """Way of the mitral plane towards the apex, mm."""
+    descent_rv: float
+    """The same of the tricuspid plane, mm."""
+    twist_apex: float
+    """Rotation of the apex about the long axis, radians, from +x towards +y.
+
+    Negative in systole: seen from below, the apex turns counter-clockwise.
+    """
+    twist_base: float
+    la: float
+    """Linear growth of the left atrium, 0 for none."""
+    ra: float

@@ -1,0 +1,36 @@
+"""Names of everything the phantom is made of."""
+
+from enum import IntEnum
+
+
+class Tissue(IntEnum):
+    """What a point of the phantom is made of."""
+
+    AIR = 0
+    FAT = 1
+    MUSCLE = 2
+    LUNG = 3
+    BONE = 4
+    LIVER = 5
+    BLOOD_VESSEL = 6
+    LV_CAVITY = 7
+    LV_MYOCARDIUM = 8
+    RV_CAVITY = 9
+    RV_WALL = 10
+    LEFT_ATRIUM = 11
+    RIGHT_ATRIUM = 12
+    ATRIAL_WALL = 13
+    AORTA = 14
+    VESSEL_WALL = 15
+    STOMACH = 16
+
+
+TRUTH_LABELS: dict[str, tuple[int, Tissue]] = {
+    "lv_cavity": (1, Tissue.LV_CAVITY),
+    "lv_myocardium": (2, Tissue.LV_MYOCARDIUM),
+    "rv_cavity": (3, Tissue.RV_CAVITY),
+    "left_atrium": (4, Tissue.LEFT_ATRIUM),
+    "right_atrium": (5, Tissue.RIGHT_ATRIUM),
+    "aorta": (6, Tissue.AORTA),
+}
+"""Name -> (value in label files, tissue); every other tissue is background, 0."""

@@ -1,0 +1,1 @@
+"""Train the segmentation network on synthetic slices alone: `python -m data_synth.training`."""

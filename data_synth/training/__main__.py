@@ -1,0 +1,76 @@
+"""Command line of the training: `python -m data_synth.training --out training --steps 10000`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from data_synth.training.loop import TrainSettings, train
+from data_synth.training.pool import PoolSettings, fill_pool
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fill the pool, train, and leave `heart.onnx` in the folder given by `--out`."""
+    options = _parser().parse_args(arguments)
+    pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
+    paths = fill_pool(options.out / "pool", pool, _say_pool)
+    if options.pool_only:
+        return 0
+    blocks = [block for path in paths for block in np.load(path)]
+    settings = TrainSettings(
+        steps=options.steps,
+        minutes=options.minutes,
+        batch=options.batch,
+        learning_rate=options.learning_rate,
+        overlap_weight=options.overlap_weight,
+        start=options.start,
+        seed=options.seed,
+        export_minutes=options.export_minutes,
+        threads=options.threads,
+    )
+    recent: list[float] = []
+
+    def say(step: int, value: float, minutes: float) -> None:
+        recent.append(value)
+        if step % 50 == 0:
+            _write(f"step {step}: loss {np.mean(recent):.4f}, {minutes:.1f} min")
+            recent.clear()
+
+    train(blocks, settings, options.out, say)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m data_synth.training", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of pool and network")
+    parser.add_argument("--hearts", type=int, default=320, help="hearts in the pool")
+    parser.add_argument("--spread", type=float, default=1.6, help="how far hearts are from mean")
+    parser.add_argument("--steps", type=int, default=8_000, help="batches to learn from")
+    parser.add_argument("--batch", type=int, default=8, help="images in a batch")
+    parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
+    parser.add_argument("--overlap-weight", type=float, default=1.0, help="of the Dice term")
+    parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time")
+    parser.add_argument("--export-minutes", type=float, default=5.0, help="time between exports")
+    parser.add_argument("--threads", type=int, default=1, help="threads of the network's own")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pool-only", action="store_true", help="fill the pool and stop")
+    return parser
+
+
+def _say_pool(done: int, total: int) -> None:
+    if done % 10 == 0 or done == total:
+        _write(f"pool: {done} of {total} hearts")
+
+
+def _write(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""The training loop: draw, learn, average, export."""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from data_synth.training.export import write_onnx
+from data_synth.training.network import HeartNet, loss
+from data_synth.training.render import draw_sample
+
+Label = npt.NDArray[np.uint8]
+Report = Callable[[int, float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class TrainSettings:
+    """How long and how fast to learn; steps or minutes, whichever ends first."""
+
+    steps: int = 8_000
+    minutes: float = math.inf
+    batch: int = 8
+    learning_rate: float = 2e-3
+    overlap_weight: float = 1.0
+    start: Path | None = None
+    """Checkpoint to go on from; by default weights are drawn at random."""
+
+    seed: int = 0
+    export_minutes: float = 5.0
+    threads: int = 1
+
+
+Batch = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
+
+
+def draw_batches(blocks: Sequence[Label], settings: TrainSettings) -> Iterator[Batch]:
+    """Endless batches of ``(n, 3, row, column)`` images and labels; the seed fixes them all."""
+    rng = np.random.default_rng([settings.seed, 7002])
+    while True:
+        picks = rng.integers(len(blocks), size=settings.batch)
+        samples = [draw_sample(rng, blocks[pick]) for pick in picks]
+        images = np.stack([sample.image for sample in samples])
+        yield images, np.stack([sample.labels for sample in samples]).astype(np.int64)
+
+
+class Average:
+    """Running mean of weights: smoother than the last step's, and what is exported."""
+
+    def __init__(self, network: HeartNet) -> None:
+        self.network = HeartNet()
+        self.network.load_state_dict(network.state_dict())
+        self.steps = 0
+
+    def update(self, network: HeartNet) -> None:
+        """Take in the weights after one more step."""
+        self.steps += 1
+        keep = min(0.997, self.steps / (self.steps + 20))
+        with torch.no_grad():
+            pairs = zip(self.network.state_dict().values(), network.state_dict().values())  # noqa: B905
+            for mean, new in pairs:
+                if mean.dtype.is_floating_point:
+                    mean.mul_(keep).add_(new, alpha=1 - keep)
+                else:
+                    mean.copy_(new)
+
+
+def train(
+    blocks: Sequence[Label], settings: TrainSettings, out: Path, report: Report | None = None
+) -> HeartNet:
+    """Train a network, writing ``out/heart.onnx`` and ``out/heart.pt`` now and then and at the end.
+
+    The result depends on the blocks, the seed and the number of steps alone (on one kind of
+    processor) when ``minutes`` does not cut it short.
+    """
+    torch.manual_seed(settings.seed)
+    torch.set_num_threads(settings.threads)
+    network = HeartNet().to(memory_format=torch.channels_last)
+    if settings.start is not None:
+        network.load_state_dict(torch.load(settings.start, weights_only=True))
+    average = Average(network)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3)
+    started_s = time.monotonic()
+    exported_s = started_s
+    for step, batch in enumerate(_ahead(draw_batches(blocks, settings), settings.steps)):
+        minutes = (time.monotonic() - started_s) / 60
+        done = max(step / settings.steps, minutes / settings.minutes)
+        if done >= 1:
+            break
+        rate = _rate(done, step) * settings.learning_rate
+        value = _learn(network, optimiser, batch, rate, settings.overlap_weight)
+        average.update(network)
+        if report is not None:
+            report(step + 1, value, minutes)
+        if time.monotonic() - exported_s > 60 * settings.export_minutes:
+            exported_s = time.monotonic()
+            save(out, average.network)
+    save(out, average.network)
+    return average.network
+
+
+def save(out: Path, network: HeartNet) -> None:
+    """Write the network as ONNX and as a checkpoint of torch's."""
+    network.eval()
+    write_onnx(out / "heart.onnx", network)
+    torch.save(network.state_dict(), out / "heart.pt")
+
+
+def _rate(done: float, step: int) -> float:
+    """Learning rate as a share of the largest: a short rise, then half a cosine down."""
+    return max(0.5 * (1 + math.cos(math.pi * done)), 0.005) * min(1.0, (step + 1) / 60)
+
+
+def _learn(
+    network: HeartNet, optimiser: Any, batch: Batch, rate: float, overlap_weight: float
+) -> float:
+    """One step of gradient descent; returns the loss."""
+    images = torch.from_numpy(batch[0]).to(memory_format=torch.channels_last)
+    labels = torch.from_numpy(batch[1])
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    network.train()
+    with torch.autocast("cpu", torch.bfloat16):
+        scores = network(images)
+    value = loss(scores, labels, overlap_weight)
+    optimiser.zero_grad(set_to_none=True)
+    value.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
+    optimiser.step()
+    return float(value.item())
+
+
+def _ahead(batches: Iterator[Batch], count: int) -> Iterator[Batch]:
+    """The first ``count`` batches, drawn by a second thread while the first one learns."""
+    ready: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=6)
+    stop = threading.Event()
+
+    def draw() -> None:
+        try:
+            for _, batch in zip(range(count), batches, strict=False):
+                while not stop.is_set():
+                    try:
+                        ready.put(batch, timeout=1.0)
+                        break
+                    except queue.Full:
+                        continue
+                if stop.is_set():
+                    return
+        except Exception as error:
+            ready.put(error)
+
+    worker = threading.Thread(target=draw, daemon=True)
+    worker.start()
+    try:
+        for _ in range(count):
+            item = ready.get()
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        stop.set()
+        worker.join()

@@ -1,0 +1,85 @@
+"""The network: a small U-Net that labels a slice and the planes a third of a spacing beside it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from data_synth.training.contrast import CLASSES
+
+WIDTHS = (16, 32, 64, 128, 192)
+"""Channels at full, half, ... resolution."""
+
+PLANES = 3
+
+
+def _block(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class HeartNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
+    """Three neighbouring slices in, seven classes on three planes out.
+
+    Skips are added, not concatenated, after a 1x1 convolution on the way up: half the arithmetic
+    of the usual U-Net at the same number of levels, which matters on a CPU.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.down = nn.ModuleList([nn.Sequential(_block(3, WIDTHS[0]))])
+        for inputs, outputs in pairwise(WIDTHS):
+            self.down.append(nn.Sequential(_block(inputs, outputs), _block(outputs, outputs)))
+        self.narrow, self.up = nn.ModuleList(), nn.ModuleList()
+        for inputs, outputs in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True):
+            self.narrow.append(nn.Conv2d(inputs, outputs, 1))
+            count = 1 if outputs == WIDTHS[0] else 2
+            self.up.append(nn.Sequential(*[_block(outputs, outputs) for _ in range(count)]))
+        self.head = nn.Conv2d(WIDTHS[0], PLANES * CLASSES, 1)
+
+    def forward(self, images: Any) -> Any:
+        """Scores ``(n, plane * class, row, column)`` of images ``(n, 3, row, column)``."""
+        skips = []
+        features = images
+        for number, block in enumerate(self.down):
+            features = block(functional.max_pool2d(features, 2) if number else features)
+            skips.append(features)
+        skips.pop()
+        for narrow, block in zip(self.narrow, self.up, strict=True):
+            features = functional.interpolate(narrow(features), scale_factor=2.0, mode="nearest")
+            features = block(features + skips.pop())
+        return self.head(features)
+
+
+def loss(scores: Any, labels: Any, overlap_weight: float = 1.0) -> Any:
+    """Cross-entropy plus, weighted, one minus soft Dice of the structures.
+
+    Dice makes small structures count from the first step, but pays for taking a doubtful pixel
+    in, which moves outlines; with cross-entropy alone the more probable class wins.
+
+    Parameters
+    ----------
+    scores
+        ``(n, plane * class, row, column)``.
+    labels
+        ``(n, plane, row, column)`` int64.
+    overlap_weight
+        Of the second term.
+    """
+    rows, columns = scores.shape[2:]
+    scores = scores.float().reshape(-1, CLASSES, rows * columns)
+    labels = labels.reshape(-1, 1, rows * columns)
+    log_chance = torch.log_softmax(scores, dim=1)
+    of_truth = log_chance.gather(1, labels)
+    # Sums by class without one-hot arrays, which would cost more than the network's head.
+    overlap = torch.zeros(CLASSES).index_add(0, labels.flatten(), of_truth.exp().flatten())
+    size = log_chance.exp().sum((0, 2)) + torch.bincount(labels.flatten(), minlength=CLASSES)
+    dice = (2 * overlap + 1) / (size + 1)
+    return -of_truth.mean() + overlap_weight * (1 - dice[1:].mean())

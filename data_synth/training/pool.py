@@ -1,0 +1,140 @@
+"""A pool of tissue blocks: beating hearts of the population, frozen and cut into thin planes.
+
+Drawing tissue is slow, drawing images of it is quick: the pool is made once and every training
+step draws new images from it. A block is a stack of thin parallel planes in a frame that
+`canonical_axes` fixes from the patient's own directions, so that left stays left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from data_synth.heart import BeatingHeart, draw_heart
+
+Float = npt.NDArray[np.float64]
+Label = npt.NDArray[np.uint8]
+Progress = Callable[[int, int], None]
+
+PIXEL_MM = 1.5
+PLANES = 48
+SIDE = 176
+PLANE_STEP_MM = (2.0, 4.2)
+"""Least and largest distance between planes. A slice's neighbour lies three planes away, so
+images are drawn with slices 6 to 12.6 mm apart."""
+
+STREAM = 7001
+"""Keeps the training hearts apart from those of studies drawn with the same seed."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoolSettings:
+    """How many hearts, how far from the mean, and the seed they come from."""
+
+    hearts: int = 320
+    blocks_per_heart: int = 2
+    spread: float = 1.6
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneFrame:
+    """Where the planes of a block lie in the patient (LPS)."""
+
+    origin_mm: Float
+    """``(3,)`` position of the first pixel of the first plane."""
+
+    axes: Float
+    """``(3, 3)`` rows: unit vectors along columns, along rows, from plane to plane."""
+
+    plane_step_mm: float
+    """Distance between planes; pixels are `PIXEL_MM` apart."""
+
+
+def canonical_axes(normal: Float) -> Float:
+    """Axes of an image plane, the same for every patient lying in the scanner.
+
+    The third axis is ``normal``, turned to run from the apex towards the base: right, posterior
+    and up. The first is the patient's left seen in the plane (in a sagittal plane, posterior);
+    the second makes the three right-handed.
+
+    Parameters
+    ----------
+    normal
+        ``(3,)`` normal of the plane, LPS, of any length and sign.
+
+    Returns
+    -------
+    (3, 3) array
+        Rows are unit vectors: along columns, along rows, from plane to plane.
+    """
+    towards_base = normal / np.linalg.norm(normal)
+    if towards_base @ (-1.0, 1.0, 1.0) < 0:
+        towards_base = -towards_base
+    left = np.array([1.0, 0.0, 0.0])
+    # Within 17 degrees of the normal, left projects onto too short a shadow to give a direction.
+    if abs(towards_base[0]) > np.cos(np.radians(17)):
+        left = np.array([0.0, 1.0, 0.0])
+    across = left - (left @ towards_base) * towards_base
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(towards_base, across), towards_base])
+
+
+def draw_frame(rng: np.random.Generator, heart: BeatingHeart) -> PlaneFrame:
+    """Draw the planes of one block: near short axis nine times in ten, else any direction."""
+    if rng.random() < 0.9:
+        normal = heart.long_axis + rng.normal(0.0, 0.2, 3)
+    else:
+        normal = rng.normal(0.0, 1.0, 3)
+    axes = canonical_axes(normal)
+    step_mm = rng.uniform(*PLANE_STEP_MM)
+    # Planes far apart cover the heart from end to end; close ones only a part, drawn at random.
+    slack_mm = max(0.0, 150.0 - PLANES * step_mm) / 2 + 10.0
+    middle_mm = heart.centre_mm + axes[2] * rng.uniform(-slack_mm, slack_mm)
+    middle_mm = middle_mm + axes[:2].T @ rng.normal(0.0, 8.0, 2)
+    half = np.array([SIDE - 1, SIDE - 1, PLANES - 1]) / 2 * (PIXEL_MM, PIXEL_MM, step_mm)
+    return PlaneFrame(middle_mm - half @ axes, axes, step_mm)
+
+
+def cut_block(heart: BeatingHeart, phase: float, frame: PlaneFrame) -> Label:
+    """Tissue at every pixel of every plane, ``(plane, row, column)``."""
+    column, row = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
+    in_plane_mm = np.stack([column.ravel(), row.ravel()], axis=1) * PIXEL_MM @ frame.axes[:2]
+    block = np.empty((PLANES, SIDE, SIDE), np.uint8)
+    for plane in range(PLANES):
+        shift_mm = frame.origin_mm + plane * frame.plane_step_mm * frame.axes[2]
+        block[plane] = heart.tissue(in_plane_mm + shift_mm, phase).reshape(SIDE, SIDE)
+    return block
+
+
+def heart_blocks(number: int, settings: PoolSettings) -> Label:
+    """The blocks of one heart, ``(block, plane, row, column)``, whatever other hearts there are."""
+    rng = np.random.default_rng([STREAM, settings.seed, number])
+    heart = draw_heart(rng, settings.spread)
+    # Half of the moments are drawn near end-systole, where the cavity is smallest and hardest.
+    phases = [
+        rng.uniform(0.0, 1.0) if k % 2 == 0 else rng.normal(0.36, 0.07)
+        for k in range(settings.blocks_per_heart)
+    ]
+    return np.stack([cut_block(heart, phase % 1.0, draw_frame(rng, heart)) for phase in phases])
+
+
+def fill_pool(folder: Path, settings: PoolSettings, progress: Progress | None = None) -> list[Path]:
+    """Write the hearts that the folder lacks, one file each; return all files in order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [
+        folder / f"seed{settings.seed}_heart{number:04d}.npy" for number in range(settings.hearts)
+    ]
+    for number, path in enumerate(paths):
+        if not path.exists():
+            part = path.with_suffix(".part")
+            with part.open("wb") as file:
+                np.save(file, heart_blocks(number, settings))
+            part.rename(path)
+        if progress is not None:
+            progress(number + 1, len(paths))
+    return paths

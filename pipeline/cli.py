@@ -1,0 +1,310 @@
+"""The command line: the only part that prints, and that ends the program.
+
+Exit codes: 0 done, 1 a stage failed, 2 the input or the command is wrong, 130 interrupted.
+Heavy libraries are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+from pipeline import __version__
+from pipeline.errors import BeatfieldError, InputError
+
+HELP = "From a patient's cine MR to a force field that a haptic robot can feel."
+
+app = App(
+    name="beatfield",
+    version=__version__,
+    help=HELP,
+    help_format="plaintext",
+    result_action="return_value",
+)
+
+Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]
+Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults without it")]
+
+
+class Console:
+    """Shows a run's course on standard error, a line for whatever takes over two seconds."""
+
+    QUIET_S = 2.0
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._last_s = 0.0
+
+    def started(self, stage: str) -> None:
+        """A stage begins."""
+        self._stage = stage
+        self._last_s = time.monotonic()
+        print(f"{stage:9s} ...", file=sys.stderr, flush=True)
+
+    def progress(self, done: int, total: int) -> None:
+        """Say how far the stage is, at most every two seconds."""
+        now_s = time.monotonic()
+        if now_s - self._last_s >= self.QUIET_S:
+            self._last_s = now_s
+            print(f"{self._stage:9s} {done}/{total}", file=sys.stderr, flush=True)
+
+    def ended(self, stage: str, outcome: str, seconds: float) -> None:
+        """A stage ended."""
+        took = f" in {seconds:.1f} s" if seconds else ""
+        print(f"{stage:9s} {outcome}{took}", file=sys.stderr, flush=True)
+
+
+def _run(
+    study: Path, out: Path, config: Path | None, first: str | None = None, last: str | None = None
+) -> dict[str, Any]:
+    from pipeline.config import read_settings
+    from pipeline.run import run_study
+    from pipeline.study import open_study
+
+    settings = read_settings(config)
+    return run_study(open_study(study), settings, out, Console(), first, last)
+
+
+def _stage_name(name: str | None) -> str | None:
+    from pipeline.run import STAGE_NAMES
+
+    if name is not None and name not in STAGE_NAMES:
+        raise InputError(f"no stage {name!r}; the stages are {', '.join(STAGE_NAMES)}")
+    return name
+
+
+@app.command
+def run(
+    study: Path,
+    /,
+    *,
+    out: Out,
+    config: Config = None,
+    from_: Annotated[str | None, Parameter(name="--from")] = None,
+    until: str | None = None,
+) -> int:
+    """Run all stages of one patient's study; finished ones that still hold are not run again.
+
+    Parameters
+    ----------
+    study
+        Folder of the study: cine/, and where there are any ecg/, us/, study.yaml.
+    from_
+        Run this stage and those after it even if nothing changed.
+    until
+        End after this stage.
+    """
+    first, last = _stage_name(from_), _stage_name(until)
+    record = _run(study, out, config, first, last)
+    print(_summary(record, out / record["patient_id"]))
+    return 0
+
+
+def _summary(record: dict[str, Any], products: Path) -> str:
+    lines = [
+        f"{name:9s} {stage['status']:8s}"
+        + (f" {stage['seconds']:7.1f} s {stage['peak_memory_mb']:6d} MB" if _timed(stage) else "")
+        + (f" {stage['cause']}" if "cause" in stage else "")
+        for name, stage in record["stages"].items()
+    ]
+    seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
+    lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
+    example = record["stages"].get("bake", {}).get("figures", {}).get("example")
+    if example:
+        point = " ".join(f"{value:g}" for value in example["point_mm"])
+        field = products / "bake" / "field.zarr"
+        lines.append(
+            f"query     beatfield query {field} --point {point} --phase {example['phase']}"
+        )
+    page = products / "report" / "index.html"
+    lines.append(f"products  {products}")
+    if page.exists():
+        lines.append(f"report    {page}")
+    return "\n".join(lines)
+
+
+def _timed(stage: dict[str, Any]) -> bool:
+    return stage.get("seconds") is not None
+
+
+def _stage_command(name: str, help_text: str) -> None:
+    def command(study: Path, /, *, out: Out, config: Config = None) -> int:
+        record = _run(study, out, config, last=name)
+        print(_summary(record, out / record["patient_id"]))
+        return 0
+
+    command.__doc__ = help_text + ", bringing the stages before it up to date."
+    app.command(command, name=name)
+
+
+for _name, _help in {
+    "ingest": "Read the cine",
+    "segment": "Label chambers and heart muscle",
+    "surface": "Extract the moving surfaces",
+    "register": "Bring tracked ultrasound to the MR",
+    "evaluate": "Measure the products against truth",
+    "report": "Write the page that shows what happened",
+}.items():
+    _stage_command(_name, _help)
+
+
+@app.command
+def bake(
+    study: Path | None = None,
+    /,
+    *,
+    out: Out,
+    surfaces: Path | None = None,
+    config: Config = None,
+) -> int:
+    """Bake the force field of a study, or of closed surfaces of one's own.
+
+    Parameters
+    ----------
+    study
+        Folder of the study; the stages before are brought up to date.
+    surfaces
+        Folder of closed surfaces in LPS mm (VTP, STL, PLY), named STRUCTURE_000, STRUCTURE_001,
+        ..., one a phase; optional phases.json. Writes OUT/field.zarr.
+    """
+    if (study is None) == (surfaces is None):
+        raise InputError("bake needs either a STUDY or --surfaces FOLDER")
+    if study is not None:
+        record = _run(study, out, config, last="bake")
+        print(_summary(record, out / record["patient_id"]))
+        return 0
+    assert surfaces is not None
+    from pipeline.config import read_settings
+    from pipeline.own_surfaces import bake_own_surfaces
+
+    field = bake_own_surfaces(surfaces, out, read_settings(config), Console().progress)
+    print(f"field     {field}")
+    return 0
+
+
+@app.command
+def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None) -> int:
+    """Run a folder of studies, each in a process of its own; print and write a table of all.
+
+    Parameters
+    ----------
+    studies
+        Folder whose subfolders are studies.
+    workers
+        How many studies to run at a time.
+    """
+    from pipeline.batch import run_batch, table
+
+    if workers < 1:
+        raise InputError(f"--workers {workers}: at least 1 is needed")
+
+    def ended(name: str, status: str, seconds: float) -> None:
+        print(f"{name:24s} {status} in {seconds:.1f} s", file=sys.stderr, flush=True)
+
+    outcomes = run_batch(studies, out, workers, config, ended)
+    print(table(outcomes))
+    print(f"table     {out / 'batch.csv'}")
+    return 0 if all(outcome.status == "done" for outcome in outcomes) else 1
+
+
+@app.command
+def query(
+    field: Path,
+    /,
+    *,
+    point: tuple[float, float, float],
+    phase: float,
+    fixture: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Ask a baked field for distance, potential and force at a point.
+
+    Parameters
+    ----------
+    field
+        The field.zarr folder.
+    point
+        X Y Z in LPS mm of the MR frame.
+    phase
+        Place in the heartbeat, [0, 1), 0 at the R peak.
+    fixture
+        Only this fixture; all of them without it.
+    as_json
+        Print JSON.
+    """
+    answers = _ask(field, point, phase, fixture)
+    if as_json:
+        print(json.dumps(answers))
+        return 0
+    for name, answer in answers.items():
+        force = " ".join(f"{value:+.4f}" for value in answer["force_n"])
+        print(
+            f"{name}: distance {answer['distance_mm']:+.3f} mm, "
+            f"potential {answer['potential']:.4f}, force {force} N"
+        )
+    return 0
+
+
+def _ask(
+    path: Path, point: tuple[float, float, float], phase: float, fixture: str | None
+) -> dict[str, dict[str, Any]]:
+    """Distance, potential and force of one fixture, or of all."""
+    from pipeline.field.query import query_point
+
+    if not 0 <= phase < 1:
+        raise InputError(f"--phase {phase:g}: lies outside [0, 1); 0 is the R peak")
+    answers = query_point(path, point, phase, fixture)
+    if not all(answer["inside_grid"] for answer in answers.values()):
+        where = " ".join(f"{value:g}" for value in point)
+        raise InputError(
+            f"--point {where}: lies outside the baked grid of {path}; give LPS millimetres of "
+            "the MR frame, near the surfaces"
+        )
+    return answers
+
+
+@app.command
+def verify(field: Path, /) -> int:
+    """Check a baked field: manifest, sizes, checksums, metadata, finite values."""
+    from pipeline.field.store import verify_field
+
+    print(f"{field}: {verify_field(field)}")
+    return 0
+
+
+@app.command(help_flags=(), version_flags=())
+def synth(
+    *arguments: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)],
+) -> int:
+    """Make synthetic patient studies: beatfield synth OUT [--seed N] [--patients N] ...
+
+    `beatfield synth --help` lists all options.
+    """
+    # A process of its own: the pipeline does not know the code that makes its test data.
+    return subprocess.call([sys.executable, "-m", "data_synth", *arguments])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit code."""
+    return _guarded(lambda: app(arguments, exit_on_error=False, print_error=True))
+
+
+def _guarded(command: Callable[[], Any]) -> int:
+    try:
+        code = command()
+    except CycloptsError:
+        return 2
+    except BeatfieldError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted; finished stages are kept", file=sys.stderr)
+        return 130
+    return code if isinstance(code, int) else 0

@@ -1,0 +1,20 @@
+"""What can go wrong, in words for the person who can mend it.
+
+A message says where, what came, what was needed and what to do.
+"""
+
+
+class BeatfieldError(Exception):
+    """Any failure that the program can name; the command line turns it into an exit code."""
+
+    exit_code = 1
+
+
+class InputError(BeatfieldError):
+    """A file, a setting or a command is wrong: the user can mend it."""
+
+    exit_code = 2
+
+
+class StageError(BeatfieldError):
+    """A stage could not do its work on input that is well formed."""

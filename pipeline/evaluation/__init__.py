@@ -1,0 +1,1 @@
+"""Measure what the stages made against truth."""

@@ -1,0 +1,238 @@
+"""Turn moving surfaces into the grids that a force server loads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.field.certificate import BeatingSurface, certify
+from pipeline.field.distance import (
+    distance_of_closed,
+    require_no_open_edge,
+    require_outward,
+    require_usable_vertices,
+)
+from pipeline.field.fixture import BakeSettings, Fixture
+from pipeline.field.metadata import (
+    FieldMetadata,
+    FixturePart,
+    GridPart,
+    StructurePart,
+    require_name,
+    require_phases,
+)
+from pipeline.field.potential import offence, potential
+from pipeline.field.reader import ForceField
+from pipeline.field.store import FieldWriter
+from pipeline.geometry import Float, Float32, Grid, Surface, require_rigid
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceSeries:
+    """One surface through the beat, where triangles may differ from phase to phase."""
+
+    surfaces: tuple[Surface, ...]
+    """One a phase."""
+
+    phases: Float
+    """``(phase,)`` in [0, 1), rising."""
+
+    def __post_init__(self) -> None:
+        if len(self.surfaces) != len(self.phases):
+            raise InputError(f"{len(self.surfaces)} surfaces for {len(self.phases)} phases")
+
+    def at(self, index: int) -> Surface:
+        """The surface at stored phase number ``index``."""
+        return self.surfaces[index]
+
+
+def bake_field(
+    out: Path,
+    surfaces: Mapping[str, BeatingSurface],
+    fixtures: Mapping[str, Fixture],
+    settings: BakeSettings,
+    *,
+    mr_from_tracker: Float | None = None,
+    rr_s: float | None = None,
+    source: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Bake distances and potentials of all phases into a new store, and measure it.
+
+    Only surfaces that a fixture uses, or that ``settings.structures`` names, are baked. One phase
+    is in memory at a time. A failure leaves a store without manifest, which is none: write into
+    a folder that is renamed when all is done.
+
+    Parameters
+    ----------
+    out
+        Where the store goes; must not exist.
+    surfaces
+        Moving surfaces by structure, all with the same phases, in LPS mm of the MR frame.
+    fixtures
+        By name; the first is the default of every question to the field.
+    settings
+        Grid, further structures, and how finely to measure.
+    mr_from_tracker
+        4x4, where the tracker is registered.
+    rr_s
+        Mean duration of a heartbeat, where it is known.
+    source
+        What the surfaces were made from, to be stored in the field; must be JSON.
+    progress
+        Called with (done, total) while phases are baked and measured.
+
+    Returns
+    -------
+    The accuracy certificate that the field also carries.
+
+    Raises
+    ------
+    InputError
+        When a fixture's surface is missing, a surface is open or faces inwards, phases differ,
+        or the field would be larger than the settings allow.
+    """
+    chosen = _choose(surfaces, fixtures, settings)
+    phases = _shared_phases(chosen)
+    if mr_from_tracker is not None:
+        require_rigid(mr_from_tracker, "mr_from_tracker")
+    structures = {name: _describe(name, moving) for name, moving in chosen.items()}
+    grid = grid_around(list(chosen.values()), settings)
+    metadata = FieldMetadata(
+        phases=phases,
+        rr_s=rr_s,
+        mr_from_tracker=None if mr_from_tracker is None else mr_from_tracker.tolist(),
+        grid=GridPart(shape_zyx=grid.shape, origin_mm=grid.origin_mm, spacing_mm=grid.spacing_mm),
+        structures=structures,
+        fixtures={name: FixturePart.of(name, fixture) for name, fixture in fixtures.items()},
+        source=dict(source or {}),
+        accuracy={},
+    )
+    _require_room(metadata, settings)
+    writer = FieldWriter(out, metadata)
+    count = _Count(2 * len(phases), progress)
+    for index in range(len(phases)):
+        for name, values in _arrays(index, chosen, fixtures, grid):
+            writer.write(name, index, values)
+        count.step()
+    accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
+    writer.finish(metadata.model_copy(update={"accuracy": accuracy}))
+    return accuracy
+
+
+class _Count:
+    def __init__(self, total: int, progress: Callable[[int, int], None] | None) -> None:
+        self._done, self._total, self._progress = 0, total, progress
+
+    def step(self) -> None:
+        self._done += 1
+        if self._progress:
+            self._progress(self._done, self._total)
+
+
+def _arrays(
+    index: int, surfaces: Mapping[str, BeatingSurface], fixtures: Mapping[str, Fixture], grid: Grid
+) -> Iterator[tuple[str, Float32]]:
+    """All arrays of one phase, by their path in the store."""
+    for structure, moving in surfaces.items():
+        distance_mm = distance_of_closed(moving.at(index), grid)
+        yield f"distance/{structure}", distance_mm
+        for name, fixture in fixtures.items():
+            if fixture.structure == structure:
+                yield f"potential/{name}", potential_grid(distance_mm, fixture)
+
+
+def potential_grid(distance_mm: Float32, fixture: Fixture) -> Float32:
+    """Potential of a fixture on a grid of distances, rounded to what is stored."""
+    exact = np.float64(1) * distance_mm
+    q_mm = offence(exact, fixture.side_code)
+    rounded: Float32 = potential(q_mm, fixture.resolved_delta_mm, fixture.m).astype(np.float32)
+    return rounded
+
+
+def grid_around(surfaces: Sequence[BeatingSurface], settings: BakeSettings) -> Grid:
+    """The smallest grid that holds all surfaces in all phases with the margin."""
+    every = [
+        moving.at(index).vertices_mm for moving in surfaces for index in range(len(moving.phases))
+    ]
+    low = np.min([vertices.min(axis=0) for vertices in every], axis=0) - settings.margin_mm
+    high = np.max([vertices.max(axis=0) for vertices in every], axis=0) + settings.margin_mm
+    steps = np.ceil((high - low) / settings.spacing_mm).astype(int)
+    # What the last step reaches too far is shared between both sides.
+    origin = low - 0.5 * (steps * settings.spacing_mm - (high - low))
+    nz, ny, nx = (int(count) + 1 for count in steps[::-1])
+    x, y, z = (float(value) for value in origin)
+    return Grid((nz, ny, nx), (x, y, z), (settings.spacing_mm,) * 3)
+
+
+def _choose(
+    surfaces: Mapping[str, BeatingSurface],
+    fixtures: Mapping[str, Fixture],
+    settings: BakeSettings,
+) -> dict[str, BeatingSurface]:
+    if not fixtures:
+        raise InputError("no fixture is given; a force field needs at least one")
+    wanted = {f"fixture {name}": fixture.structure for name, fixture in fixtures.items()}
+    wanted |= {f"bake.structures {name}": name for name in settings.structures}
+    missing = [f"{who} needs {name!r}" for who, name in wanted.items() if name not in surfaces]
+    if missing:
+        existing = ", ".join(sorted(surfaces)) or "none"
+        raise InputError(
+            f"{'; '.join(missing)}; the surfaces that exist are {existing}: change the fixture's "
+            "structure, or supply that surface"
+        )
+    for name in fixtures:
+        require_name(name, "fixture")
+    return {name: surfaces[name] for name in dict.fromkeys(wanted.values())}
+
+
+def _shared_phases(surfaces: Mapping[str, BeatingSurface]) -> list[float]:
+    first_name, first = next(iter(surfaces.items()))
+    for name, moving in surfaces.items():
+        if not np.array_equal(moving.phases, first.phases):
+            raise InputError(
+                f"{name} has {len(moving.phases)} phases, {first_name} {len(first.phases)}, and "
+                "all surfaces need the same ones"
+            )
+    phases: list[float] = np.asarray(first.phases, dtype=np.float64).tolist()
+    try:
+        require_phases(phases, "phases")
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    return phases
+
+
+def _describe(name: str, moving: BeatingSurface) -> StructurePart:
+    """Refuse surfaces that cannot be baked; say what the others are."""
+    require_name(name, "structure")
+    each = [moving.at(index) for index in range(len(moving.phases))]
+    for index, surface in enumerate(each):
+        where = f"{name}, phase {index}"
+        require_usable_vertices(surface, where)
+        # Which edges are shared does not depend on where the vertices are.
+        if index == 0 or surface.triangles is not each[index - 1].triangles:
+            require_no_open_edge(surface, where)
+        require_outward(surface, where)
+    return StructurePart(
+        path=f"distance/{name}",
+        triangles=[len(surface.triangles) for surface in each],
+        volume_ml=[surface.volume_mm3() / 1000 for surface in each],
+    )
+
+
+def _require_room(metadata: FieldMetadata, settings: BakeSettings) -> None:
+    nodes = int(np.prod(metadata.grid.shape_zyx))
+    size_mb = 4e-6 * nodes * len(metadata.phases) * len(metadata.arrays)
+    if size_mb > settings.largest_store_mb:
+        spacing_mm = settings.spacing_mm * (size_mb / settings.largest_store_mb) ** (1 / 3)
+        raise InputError(
+            f"bake: the field would take {size_mb:.0f} MB with spacing_mm = "
+            f"{settings.spacing_mm:g}, more than largest_store_mb = "
+            f"{settings.largest_store_mb:g}; spacing_mm = {np.ceil(spacing_mm * 20) / 20:g} "
+            "would do, or raise the limit"
+        )

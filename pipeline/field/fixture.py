@@ -1,0 +1,210 @@
+"""Virtual fixtures, the haptic devices that bound them, and the settings of the bake stage.
+
+The potential of a fixture is ``f(q) = 1 - exp(-(q^2 / (2 delta^2))^m)``; its force is at most
+``f_max_n``. Everything here is plain data: importing it costs milliseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Kind = Literal["guidance", "forbidden_region"]
+Side = Literal["inside", "outside"]
+DeviceName = Literal["touch", "falcon", "omega7"]
+
+# A delta that was computed as the smallest allowed must itself be allowed after rounding.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """What a haptic device can render."""
+
+    force_n: float
+    """Largest force it can exert."""
+
+    stiffness_n_per_m: float | None
+    """Stiffest spring it can render; None where none is known and only the force is checked."""
+
+
+DEVICES: Mapping[str, Device] = MappingProxyType(
+    {
+        "touch": Device(force_n=3.3, stiffness_n_per_m=400.0),
+        "falcon": Device(force_n=8.9, stiffness_n_per_m=None),
+        "omega7": Device(force_n=12.0, stiffness_n_per_m=5000.0),
+    }
+)
+
+
+def steepest_slope(m: int) -> float:
+    """Largest slope of the potential over ``q / delta``, reached where f is most curved.
+
+    With ``s = (2m - 1) / (2m)`` the slope ``f'(q)`` is largest at ``(q^2 / (2 delta^2))^m = s``
+    and is there ``m sqrt(2) s^s exp(-s) / delta``.
+
+    >>> [round(steepest_slope(m), 3) for m in (1, 2, 3)]
+    [0.607, 1.077, 1.584]
+    """
+    s = (2 * m - 1) / (2 * m)
+    return m * math.sqrt(2) * math.pow(s, s) * math.exp(-s)
+
+
+def delta_from_gamma(gamma_mm: float, level: float, m: int) -> float:
+    """Width ``delta`` in mm of the potential that reaches ``level`` at ``gamma_mm``.
+
+    >>> round(delta_from_gamma(3.0, 0.01, 2), 3)
+    6.7
+    """
+    return gamma_mm / (math.sqrt(2) * math.pow(-math.log1p(-level), 1 / (2 * m)))
+
+
+class Section(BaseModel):
+    """Settings that refuse unknown keys and changes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Fixture(Section):
+    """One virtual fixture: which surface acts on the tool, and how."""
+
+    structure: str = Field(min_length=1)
+    """Name of the surface."""
+
+    kind: Kind
+    """``guidance`` attracts to the surface; ``forbidden_region`` pushes out of one side of it."""
+
+    side: Side | None = None
+    """The side that is forbidden; only for ``forbidden_region``."""
+
+    delta_mm: float | None = Field(default=None, gt=0)
+    """Width of the potential. Give this or ``gamma_mm``."""
+
+    gamma_mm: float | None = Field(default=None, gt=0)
+    """Half-width of the workspace in which the tool should feel next to nothing."""
+
+    gamma_level: float = Field(default=0.01, gt=0, lt=1)
+    """Value of the potential at ``gamma_mm``."""
+
+    m: int = Field(default=1, ge=1, le=20)
+    """Sharpness: 1 is a Gaussian well, more is a flatter floor with steeper walls."""
+
+    f_max_n: float = Field(gt=0)
+    """Force far from the floor of the well."""
+
+    device: DeviceName = "touch"
+    """The haptic device that will render the force."""
+
+    @model_validator(mode="after")
+    def _one_width(self) -> Self:
+        if (self.delta_mm is None) == (self.gamma_mm is None):
+            given = "neither" if self.delta_mm is None else "both"
+            raise ValueError(f"needs exactly one of delta_mm and gamma_mm, got {given}")
+        if self.gamma_mm is None and "gamma_level" in self.model_fields_set:
+            raise ValueError("gamma_level belongs to gamma_mm; with delta_mm leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _side_of_a_forbidden_region(self) -> Self:
+        if self.kind == "forbidden_region" and self.side is None:
+            raise ValueError("a forbidden_region needs side: inside or outside, what is forbidden")
+        if self.kind == "guidance" and self.side is not None:
+            raise ValueError("side belongs to a forbidden_region; a guidance acts on both sides")
+        return self
+
+    @model_validator(mode="after")
+    def _within_the_device(self) -> Self:
+        limit = DEVICES[self.device]
+        if self.f_max_n > limit.force_n * (1 + ROUNDING):
+            raise ValueError(
+                f"f_max_n = {self.f_max_n:g} N is beyond the {self.device}, which exerts "
+                f"{limit.force_n:g} N at most; lower f_max_n or choose another device"
+            )
+        allowed = limit.stiffness_n_per_m
+        if allowed is not None and self.stiffness_n_per_m > allowed * (1 + ROUNDING):
+            raise ValueError(self._too_stiff(allowed))
+        return self
+
+    def _too_stiff(self, allowed_n_per_m: float) -> str:
+        factor = self.stiffness_n_per_m / allowed_n_per_m
+        name = "delta_mm" if self.gamma_mm is None else "gamma_mm"
+        given = self.delta_mm if self.gamma_mm is None else self.gamma_mm
+        assert given is not None
+        # Rounded up, so that the printed number is itself accepted.
+        smallest = math.ceil(given * factor * 1e3) / 1e3
+        smallest_delta = math.ceil(self.resolved_delta_mm * factor * 1e3) / 1e3
+        also = "" if name == "delta_mm" else f", which is {name} = {smallest:g}"
+        return (
+            f"is stiffer than the {self.device} can render: {self.stiffness_n_per_m:.0f} N/m, at "
+            f"most {allowed_n_per_m:g} N/m; the smallest width that would do is delta_mm = "
+            f"{smallest_delta:g}{also} (or lower f_max_n)"
+        )
+
+    @property
+    def resolved_delta_mm(self) -> float:
+        """Width of the potential, given or derived from gamma."""
+        if self.delta_mm is not None:
+            return self.delta_mm
+        assert self.gamma_mm is not None
+        return delta_from_gamma(self.gamma_mm, self.gamma_level, self.m)
+
+    @property
+    def resolved_gamma_mm(self) -> float:
+        """Distance at which the potential is ``gamma_level``, given or derived from delta."""
+        if self.gamma_mm is not None:
+            return self.gamma_mm
+        return self.resolved_delta_mm / delta_from_gamma(1.0, self.gamma_level, self.m)
+
+    @property
+    def stiffness_n_per_m(self) -> float:
+        """Steepest slope of the force over distance."""
+        return 1000 * self.f_max_n * steepest_slope(self.m) / self.resolved_delta_mm
+
+    @property
+    def side_code(self) -> int:
+        """0 for guidance, +1 where the outside is forbidden, -1 where the inside is."""
+        return {None: 0, "outside": 1, "inside": -1}[self.side]
+
+
+DEFAULT_FIXTURES: dict[str, Fixture] = {
+    "epicardium_guidance": Fixture(
+        structure="epicardium", kind="guidance", gamma_mm=3.0, m=2, f_max_n=2.0
+    ),
+    "left_atrium_guidance": Fixture(
+        structure="left_atrium", kind="guidance", gamma_mm=2.5, m=2, f_max_n=2.0
+    ),
+    # A tool inside the left ventricle must not leave through the wall.
+    "left_ventricle_forbidden": Fixture(
+        structure="epicardium",
+        kind="forbidden_region",
+        side="outside",
+        delta_mm=3.0,
+        m=1,
+        f_max_n=1.9,
+    ),
+}
+"""The fixtures of the default configuration, all of which a Touch can render."""
+
+
+class BakeSettings(Section):
+    """How surfaces become grids."""
+
+    spacing_mm: float = Field(default=2.0, gt=0)
+    """Distance between grid nodes, the same on every axis."""
+
+    margin_mm: float = Field(default=15.0, ge=15)
+    """Grid around the surfaces on every side, in all phases."""
+
+    structures: tuple[str, ...] = ()
+    """Surfaces to bake beside those that a fixture needs."""
+
+    samples: int = Field(default=500, ge=100)
+    """Random points per surface and phase at which the finished field is checked."""
+
+    largest_store_mb: float = Field(default=4000.0, gt=0)
+    """A field that would take more on disk is refused before work begins."""

@@ -1,0 +1,153 @@
+"""What a field says of itself: the schema of the ``beatfield`` attributes."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipeline.errors import InputError
+from pipeline.field.fixture import DeviceName, Fixture, Kind, Side
+
+FORMAT_VERSION = 1
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+Row = tuple[float, float, float, float]
+
+INTERPOLATION = {
+    "space": "tricubic Catmull-Rom of the distance; straight-line ghost nodes at the boundary; "
+    "points outside the grid are moved to its boundary",
+    "time": "linear between stored phases; the first follows the last",
+    "force": "-f_max * f(q) * direction, f and the direction from the interpolated distance",
+    "direction": "gradient / max(length of the gradient, 0.5): a unit vector except near the "
+    "medial axis, where it passes continuously through zero",
+}
+
+
+class Part(BaseModel):
+    """A part of the metadata: unknown keys and values that are not numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GridPart(Part):
+    """The grid that all arrays share."""
+
+    shape_zyx: tuple[int, int, int]
+    origin_mm: tuple[float, float, float]
+    spacing_mm: tuple[float, float, float]
+
+
+class StructurePart(Part):
+    """One surface's distance."""
+
+    path: str
+    triangles: list[int]
+    """Per phase."""
+    volume_ml: list[float]
+    """Per phase, enclosed."""
+
+
+class FixturePart(Part):
+    """One fixture's potential, as resolved."""
+
+    path: str
+    structure: str
+    kind: Kind
+    side: Side | None
+    gamma_mm: float
+    gamma_level: float
+    delta_mm: float
+    m: int
+    f_max_n: float
+    device: DeviceName
+    stiffness_n_per_m: float
+
+    @classmethod
+    def of(cls, name: str, fixture: Fixture) -> Self:
+        """What the store says of a fixture."""
+        return cls(
+            path=f"potential/{name}",
+            structure=fixture.structure,
+            kind=fixture.kind,
+            side=fixture.side,
+            gamma_mm=fixture.resolved_gamma_mm,
+            gamma_level=fixture.gamma_level,
+            delta_mm=fixture.resolved_delta_mm,
+            m=fixture.m,
+            f_max_n=fixture.f_max_n,
+            device=fixture.device,
+            stiffness_n_per_m=fixture.stiffness_n_per_m,
+        )
+
+    def fixture(self) -> Fixture:
+        """The fixture that these numbers describe."""
+        return Fixture(
+            structure=self.structure,
+            kind=self.kind,
+            side=self.side,
+            delta_mm=self.delta_mm,
+            m=self.m,
+            f_max_n=self.f_max_n,
+            device=self.device,
+        )
+
+
+class FieldMetadata(Part):
+    """The ``beatfield`` attributes of a field."""
+
+    format_version: Literal[1] = 1
+    frame: Literal["LPS"] = "LPS"
+    unit: Literal["mm"] = "mm"
+    phases: list[float] = Field(min_length=1)
+    periodic: Literal[True] = True
+    rr_s: float | None = Field(gt=0)
+    mr_from_tracker: tuple[Row, Row, Row, Row] | None
+    grid: GridPart
+    structures: dict[str, StructurePart] = Field(min_length=1)
+    fixtures: dict[str, FixturePart] = Field(min_length=1)
+    interpolation: dict[str, str] = INTERPOLATION
+    source: dict[str, Any]
+    accuracy: dict[str, Any]
+
+    @model_validator(mode="after")
+    def _phases_rise(self) -> Self:
+        require_phases(self.phases, "phases")
+        return self
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> Self:
+        for name, structure in self.structures.items():
+            require_name(name, "structure")
+            if structure.path != f"distance/{name}":
+                raise ValueError(f"structure {name}: path {structure.path!r} is not its own")
+        for name, fixture in self.fixtures.items():
+            require_name(name, "fixture")
+            if fixture.path != f"potential/{name}":
+                raise ValueError(f"fixture {name}: path {fixture.path!r} is not its own")
+            if fixture.structure not in self.structures:
+                raise ValueError(f"fixture {name}: no structure {fixture.structure!r}")
+        return self
+
+    @property
+    def arrays(self) -> list[str]:
+        """Paths of all arrays in the store."""
+        structures = [structure.path for structure in self.structures.values()]
+        return structures + [fixture.path for fixture in self.fixtures.values()]
+
+
+def require_phases(phases: list[float], where: str) -> None:
+    """Raise ValueError unless phases rise within [0, 1)."""
+    inside = all(0 <= phase < 1 for phase in phases)
+    if not phases or not inside or any(b <= a for a, b in itertools.pairwise(phases)):
+        raise ValueError(f"{where} must rise within [0, 1), got {phases}")
+
+
+def require_name(name: str, what: str) -> None:
+    """Raise InputError unless a name can be a folder everywhere."""
+    if not NAME.fullmatch(name):
+        raise InputError(
+            f"{what} name {name!r}: needs letters, digits, '_' and '-', a letter or digit first"
+        )

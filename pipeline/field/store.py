@@ -1,0 +1,87 @@
+"""Write a field as a Zarr v3 group, one phase at a time, and seal it with a manifest.
+
+Every chunk is one phase as raw little-endian float32, so that any program can map it. The
+manifest is written last: a store without it is not a store.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.field.manifest import write_manifest
+from pipeline.field.metadata import FieldMetadata
+from pipeline.field.verify import Report, verify_field
+from pipeline.geometry import Float32
+
+__all__ = ["FieldWriter", "Report", "verify_field"]
+
+
+class FieldWriter:
+    """A store in the making; hold one phase, write it, forget it."""
+
+    def __init__(self, path: Path, metadata: FieldMetadata) -> None:
+        """Create the empty group and arrays at ``path``, which must not hold any."""
+        import zarr
+
+        self._path = path
+        self._group = zarr.create_group(path, zarr_format=3, attributes=attributes(metadata))
+        self._arrays = {name: self._create(name, metadata) for name in metadata.arrays}
+
+    def _create(self, name: str, metadata: FieldMetadata) -> Any:
+        from zarr.codecs import BytesCodec
+
+        shape = metadata.grid.shape_zyx
+        return self._group.create_array(
+            name,
+            shape=(len(metadata.phases), *shape),
+            chunks=(1, *shape),
+            dtype="float32",
+            serializer=BytesCodec(endian="little"),
+            compressors=None,
+            filters=None,
+            fill_value=np.nan,
+            dimension_names=("t", "z", "y", "x"),
+            config={"write_empty_chunks": True},
+        )
+
+    def write(self, name: str, index: int, values: Float32) -> None:
+        """Write phase ``index`` of the array ``name``, ``(z, y, x)``."""
+        self._arrays[name][index] = values
+
+    def finish(self, metadata: FieldMetadata) -> None:
+        """Write the final attributes, then the manifest."""
+        self._group.update_attributes(attributes(metadata))
+        write_manifest(self._path)
+
+
+def attributes(metadata: FieldMetadata) -> dict[str, Any]:
+    """Attributes of the group: OME-NGFF 0.5 multiscales, one for each array, and our own."""
+    return {
+        "ome": {
+            "version": "0.5",
+            "multiscales": [_multiscale(name, metadata) for name in metadata.arrays],
+        },
+        "beatfield": metadata.model_dump(mode="json"),
+    }
+
+
+def _multiscale(name: str, metadata: FieldMetadata) -> dict[str, Any]:
+    grid = metadata.grid
+    time: dict[str, Any] = {"name": "t", "type": "time"}
+    if metadata.rr_s is not None:
+        time["unit"] = "second"
+    beat = 1.0 if metadata.rr_s is None else metadata.rr_s
+    step = beat / len(metadata.phases)
+    space = [{"name": axis, "type": "space", "unit": "millimeter"} for axis in "zyx"]
+    placed = [
+        {"type": "scale", "scale": [step, *grid.spacing_mm[::-1]]},
+        {"type": "translation", "translation": [beat * metadata.phases[0], *grid.origin_mm[::-1]]},
+    ]
+    return {
+        "name": name,
+        "axes": [time, *space],
+        "datasets": [{"path": name, "coordinateTransformations": placed}],
+    }

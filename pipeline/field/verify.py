@@ -1,0 +1,190 @@
+"""Check a baked field: every byte, the description, and that the values make sense."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.field.manifest import MANIFEST, canonical_manifest, entry
+from pipeline.field.metadata import FieldMetadata, FixturePart
+from pipeline.field.potential import offence, potential
+from pipeline.field.reader import map_phase, read_metadata
+from pipeline.geometry import Grid
+
+# Stored potentials are rounded to float32: half a step below 1 is 2^-25. Another machine's
+# exponential may differ in its last bit, which can move the rounding by one step, 2^-24.
+POTENTIAL_TOLERANCE = 2.0**-23
+
+ARRAY_MUST_HAVE: Mapping[str, Any] = {
+    "zarr_format": 3,
+    "node_type": "array",
+    "data_type": "float32",
+    "fill_value": "NaN",
+    "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+    "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was checked in a field that is whole."""
+
+    files: int
+    """Files whose size and SHA-256 agree with the manifest."""
+
+    bytes: int
+    """Their size together."""
+
+    phases: int
+    """Stored phases."""
+
+    structures: tuple[str, ...]
+    """Surfaces whose distances are all finite."""
+
+    fixtures: tuple[str, ...]
+    """Fixtures whose potential is the formula evaluated on the distance."""
+
+    def __str__(self) -> str:
+        return (
+            f"whole: {self.files} files, {self.bytes / 1e6:.1f} MB, {self.phases} phases, "
+            f"structures {', '.join(self.structures)}; fixtures {', '.join(self.fixtures)}"
+        )
+
+
+def verify_field(path: Path, progress: Callable[[int, int], None] | None = None) -> Report:
+    """Check a field: manifest, files, checksums, description, values.
+
+    Any changed, missing or added byte is found, the manifest's own included.
+
+    Parameters
+    ----------
+    path
+        The ``field.zarr`` folder.
+    progress
+        Called with (done, total) while files and phases are read.
+
+    Raises
+    ------
+    InputError
+        When anything is wrong, naming all that is.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
+    files = _read_manifest(path / MANIFEST)
+    _refuse(path, list(_file_problems(path, files, progress)))
+    metadata = read_metadata(path)
+    _refuse(path, [problem for name in metadata.arrays for problem in _array(path, name, metadata)])
+    _refuse(path, list(_value_problems(path, metadata)))
+    return Report(
+        files=len(files),
+        bytes=sum(one["size"] for one in files.values()),
+        phases=len(metadata.phases),
+        structures=tuple(metadata.structures),
+        fixtures=tuple(metadata.fixtures),
+    )
+
+
+def _refuse(path: Path, problems: list[str]) -> None:
+    if problems:
+        shown = problems[:20]
+        more = [f"and {len(problems) - 20} more"] if len(problems) > 20 else []
+        listed = "\n  ".join([*shown, *more])
+        raise InputError(f"{path}: is damaged; bake it again\n  {listed}")
+
+
+def _read_manifest(source: Path) -> dict[str, dict[str, Any]]:
+    """Files by name, when the manifest is byte for byte what would be written for them."""
+    try:
+        raw = source.read_bytes()
+        files: dict[str, dict[str, Any]] = json.loads(raw)["files"]
+        whole = raw == canonical_manifest(files)
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{source.parent}: has no {MANIFEST}, so it is no complete field; bake it again"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{source}: is damaged ({error!r}); bake the field again") from error
+    if not whole or "zarr.json" not in files:
+        raise InputError(f"{source}: is damaged, its own digest does not agree; bake again")
+    return files
+
+
+def _file_problems(
+    path: Path,
+    files: Mapping[str, Mapping[str, Any]],
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[str]:
+    present = {
+        file.relative_to(path).as_posix()
+        for file in path.rglob("*")
+        if file.is_symlink() or not file.is_dir()
+    } - {MANIFEST}
+    yield from (f"{name}: is missing" for name in sorted(set(files) - present))
+    yield from (f"{name}: is not in the manifest" for name in sorted(present - set(files)))
+    both = sorted(present & set(files))
+    for done, name in enumerate(both, start=1):
+        try:
+            actual = entry(path / name)
+        except OSError as error:
+            yield f"{name}: cannot be read ({error.strerror})"
+            continue
+        if actual != files[name]:
+            yield _difference(name, actual, files[name])
+        if progress:
+            progress(done, len(both))
+
+
+def _difference(name: str, actual: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
+    if actual["size"] != expected["size"]:
+        return f"{name}: {actual['size']} bytes, the manifest says {expected['size']}"
+    return f"{name}: its SHA-256 is not that of the manifest"
+
+
+def _array(path: Path, name: str, metadata: FieldMetadata) -> Iterator[str]:
+    """What in an array's own description disagrees with the format."""
+    try:
+        described = json.loads((path / name / "zarr.json").read_bytes())
+    except (OSError, ValueError) as error:
+        yield f"{name}/zarr.json: cannot be read ({error})"
+        return
+    shape = list(metadata.grid.shape_zyx)
+    expected = {
+        **ARRAY_MUST_HAVE,
+        "shape": [len(metadata.phases), *shape],
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [1, *shape]}},
+    }
+    for key, value in expected.items():
+        if described.get(key) != value:
+            yield f"{name}/zarr.json: {key} is {described.get(key)!r}, needed {value!r}"
+
+
+def _value_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
+    grid = Grid(metadata.grid.shape_zyx, metadata.grid.origin_mm, metadata.grid.spacing_mm)
+    for index in range(len(metadata.phases)):
+        for name, structure in metadata.structures.items():
+            values = map_phase(path / structure.path, index, grid)
+            if not np.isfinite(values).all():
+                yield f"{structure.path}: phase {index} holds values that are not finite"
+                continue
+            distance_mm = values.astype(np.float64)
+            for fixture in metadata.fixtures.values():
+                if fixture.structure == name:
+                    stored = map_phase(path / fixture.path, index, grid)
+                    yield from _potential_problems(stored, distance_mm, fixture, index)
+
+
+def _potential_problems(
+    stored: Any, distance_mm: Any, part: FixturePart, index: int
+) -> Iterator[str]:
+    side = part.fixture().side_code
+    formula = potential(offence(distance_mm, side), part.delta_mm, part.m)
+    # A value that is not a number fails the comparison, as it should.
+    if not (np.abs(stored - formula) <= POTENTIAL_TOLERANCE).all():
+        yield f"{part.path}: phase {index} is not the formula evaluated on {part.structure}"

@@ -1,0 +1,136 @@
+"""Values with a place in space: grids, surfaces and rigid motions, all in LPS millimetres.
+
+Points are ``(x, y, z)``; arrays are ``(z, y, x)`` or ``(phase, z, y, x)``. A transform is a 4x4
+matrix on column points, named target first: ``mr_from_index`` takes ``(x, y, z)`` indices to
+patient millimetres. Nothing here opens a file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InputError
+
+Float = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Integer = npt.NDArray[np.int64]
+Label = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+
+def transform_points(target_from_source: Float, points: Float) -> Float:
+    """Carry ``(..., 3)`` points from the source frame to the target frame.
+
+    >>> shift = np.eye(4); shift[:3, 3] = 1, 2, 3
+    >>> transform_points(shift, np.zeros((1, 3)))
+    array([[1., 2., 3.]])
+    """
+    moved: Float = points @ target_from_source[:3, :3].T + target_from_source[:3, 3]
+    return moved
+
+
+def require_rigid(transform: Float, where: str) -> None:
+    """Raise InputError unless ``transform`` is a rotation and a shift (finite, 1e-3 in angle)."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        raise InputError(f"{where}: needs a finite 4x4 matrix, got\n{transform}")
+    rotation = transform[:3, :3]
+    proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not proper or np.linalg.det(rotation) < 0 or not np.allclose(transform[3], (0, 0, 0, 1)):
+        raise InputError(f"{where}: is not a rotation and a shift, got\n{transform}")
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Regular axis-aligned nodes in LPS millimetres."""
+
+    shape: tuple[int, int, int]
+    """Number of nodes along z, y, x: the shape of the arrays that live here."""
+
+    origin_mm: tuple[float, float, float]
+    """Position ``(x, y, z)`` of the first node."""
+
+    spacing_mm: tuple[float, float, float]
+    """Distance between neighbours along ``(x, y, z)``."""
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 2:
+            raise InputError(f"a grid needs 2 nodes or more on every axis, got {self.shape}")
+        if not min(self.spacing_mm) > 0:
+            raise InputError(f"a grid's spacing must be positive, got {self.spacing_mm} mm")
+
+    @property
+    def upper_mm(self) -> Float:
+        """Position ``(x, y, z)`` of the last node."""
+        steps = np.array(self.shape[::-1]) - 1
+        return np.asarray(self.origin_mm + steps * np.array(self.spacing_mm))
+
+    def nodes_mm(self) -> Float:
+        """Positions of all nodes, ``(z, y, x, 3)``."""
+        axes = [
+            origin + spacing * np.arange(count)
+            for origin, spacing, count in zip(
+                self.origin_mm, self.spacing_mm, self.shape[::-1], strict=True
+            )
+        ]
+        z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+        return np.stack([x, y, z], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A triangle mesh in LPS millimetres; normals point out of the body it encloses."""
+
+    vertices_mm: Float
+    """``(n, 3)`` positions."""
+
+    triangles: Integer
+    """``(m, 3)`` vertex numbers, counter-clockwise seen from outside."""
+
+    def __post_init__(self) -> None:
+        if self.vertices_mm.ndim != 2 or self.vertices_mm.shape[1] != 3:
+            raise InputError(f"vertices must be (n, 3), got {self.vertices_mm.shape}")
+        if self.triangles.ndim != 2 or self.triangles.shape[1] != 3 or not len(self.triangles):
+            raise InputError(f"triangles must be (m, 3) with m > 0, got {self.triangles.shape}")
+
+    def volume_mm3(self) -> float:
+        """Enclosed volume by the divergence theorem; negative when normals point inwards."""
+        a, b, c = (self.vertices_mm[self.triangles[:, k]] for k in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    def boundary_edges(self) -> Integer:
+        """Edges that break closedness, ``(k, 2)``: not shared by two opposed triangles."""
+        t = self.triangles
+        directed = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+        key = directed[:, 0] * np.int64(len(self.vertices_mm)) + directed[:, 1]
+        opposed = directed[:, 1] * np.int64(len(self.vertices_mm)) + directed[:, 0]
+        unique, count = np.unique(key, return_counts=True)
+        good = np.isin(key, opposed) & (count[np.searchsorted(unique, key)] == 1)
+        return np.asarray(directed[~good])
+
+
+@dataclass(frozen=True, slots=True)
+class MovingSurface:
+    """One surface through the beat: vertex i is the same material point in every phase."""
+
+    vertices_mm: Float
+    """``(phase, n, 3)`` positions."""
+
+    triangles: Integer
+    """``(m, 3)`` vertex numbers, the same in every phase."""
+
+    phases: Float
+    """``(phase,)`` in [0, 1), rising."""
+
+    def __post_init__(self) -> None:
+        if self.vertices_mm.ndim != 3 or len(self.vertices_mm) != len(self.phases):
+            raise InputError(
+                f"vertices must be (phase, n, 3) for {len(self.phases)} phases, "
+                f"got {self.vertices_mm.shape}"
+            )
+
+    def at(self, index: int) -> Surface:
+        """The surface at stored phase number ``index``."""
+        return Surface(self.vertices_mm[index], self.triangles)

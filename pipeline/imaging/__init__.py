@@ -1,0 +1,1 @@
+"""Read cine MR, ECG and tracked ultrasound; segment the heart."""

@@ -1,0 +1,215 @@
+"""Read an electrocardiogram from WFDB, CSV or DICOM waveform files."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float
+
+MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
+"""Millivolts in one unit, by its name in lower case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ecg:
+    """A recording of one or more leads, evenly sampled."""
+
+    signal_mv: Float
+    """``(n, leads)`` millivolts, finite; no lead is constant."""
+
+    leads: tuple[str, ...]
+    """Name of each column."""
+
+    sampling_rate_hz: float
+    """Samples a second."""
+
+    start_s: float = 0.0
+    """Time of the first sample on the recording's own clock."""
+
+
+def read_ecg(path: Path) -> Ecg:
+    """Read one recording.
+
+    Parameters
+    ----------
+    path
+        A WFDB record (its stem, or its ``.hea`` or ``.dat`` file), a ``.csv`` table (a header row,
+        first column ``time_s``, then one column of millivolts a lead), or a DICOM waveform file.
+
+    Raises
+    ------
+    InputError
+        When the recording is missing, truncated, in an unknown unit, unevenly sampled, or has a
+        lead that is constant or not finite.
+    """
+    path = Path(path)
+    header = path.with_suffix(".hea") if path.suffix == ".dat" else Path(f"{path}.hea")
+    if path.suffix == ".hea" or header.is_file():
+        ecg = _read_wfdb(path if path.suffix == ".hea" else header)
+    elif not path.is_file():
+        raise InputError(
+            f"{path}: no such ECG; neither this file nor {header.name} exists; name a WFDB record, "
+            "a .csv table or a DICOM waveform file"
+        )
+    elif path.suffix.lower() == ".csv":
+        ecg = _read_csv(path)
+    else:
+        ecg = _read_dicom(path)
+    _require_usable(ecg, path)
+    return ecg
+
+
+@contextmanager
+def _quiet_wfdb() -> Iterator[Any]:
+    """The library, imported when first needed: it brings pandas, and calls deprecated parts."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield importlib.import_module("wfdb")
+
+
+def _read_wfdb(header: Path) -> Ecg:
+    """Read a record by its ``.hea`` file."""
+    if not header.is_file():
+        raise InputError(f"{header}: no such file; a WFDB record needs its .hea and .dat files")
+    try:
+        with _quiet_wfdb() as wfdb:
+            record = wfdb.rdrecord(str(header.with_suffix("").absolute()), return_res=64)
+    # The library raises its parser's own errors (IndexError, TypeError ...) on damaged files.
+    except Exception as error:
+        raise InputError(
+            f"{header}: cannot be read as a WFDB record ({error}); it needs a whole header and "
+            "every .dat file it names, of the length it gives; copy the record again"
+        ) from error
+    factors = [_millivolts(unit, str(header)) for unit in record.units]
+    signal_mv = np.asarray(record.p_signal, dtype=float) * factors
+    return Ecg(signal_mv, tuple(record.sig_name), float(record.fs))
+
+
+def _read_csv(path: Path) -> Ecg:
+    """Read a table of times and millivolts."""
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").strip().splitlines()
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    if len(names) < 2 or names[0] != "time_s":
+        raise InputError(
+            f"{path}: the first row is {names}; it needs time_s and then the name of each lead, "
+            "separated by commas"
+        )
+    rows = [_csv_row(path, number, line, len(names)) for number, line in enumerate(lines[1:], 2)]
+    if len(rows) < 2:
+        raise InputError(f"{path}: has {len(rows)} rows of samples; it needs 2 or more")
+    table = np.array(rows)
+    step_s = _even_step_s(table[:, 0], path)
+    return Ecg(table[:, 1:], tuple(names[1:]), 1 / step_s, float(table[0, 0]))
+
+
+def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
+    """The numbers of one line."""
+    cells = line.split(",")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = []
+    if len(values) != columns:
+        raise InputError(
+            f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
+            "mend or delete the line"
+        )
+    return values
+
+
+def _even_step_s(times_s: Float, path: Path) -> float:
+    """Time between samples; each must lie within half a step of an even grid."""
+    steps_s = np.diff(times_s)
+    if not (steps_s > 0).all():
+        worst = int(np.argmin(steps_s > 0))
+        raise InputError(
+            f"{path}: time_s does not rise from {times_s[worst]} to {times_s[worst + 1]} s "
+            f"(line {worst + 3}); sort the rows by time"
+        )
+    number = np.arange(len(times_s)) - (len(times_s) - 1) / 2
+    # Least squares: the ends alone would carry their own rounding into the rate.
+    even_s = float(number @ (times_s - times_s[0]) / (number @ number))
+    off_grid_s = np.ptp(times_s - even_s * number)
+    # Rounded times stay within half a step of the grid and no step doubles; a lost sample does it.
+    if off_grid_s > even_s or steps_s.max() > 1.75 * even_s:
+        gap = int(np.argmax(steps_s))
+        raise InputError(
+            f"{path}: samples are not evenly spaced: {steps_s[gap]:.6g} s after {times_s[gap]} s, "
+            f"where {even_s:.6g} s is the mean; fill the gap or cut the recording there"
+        )
+    return even_s
+
+
+def _read_dicom(path: Path) -> Ecg:
+    """Read the longest group of channels of a DICOM waveform file."""
+    import pydicom
+
+    try:
+        dataset = pydicom.dcmread(path)
+    except Exception as error:
+        raise InputError(
+            f"{path}: is neither a WFDB record, nor .csv, nor DICOM ({error}); convert it to one"
+        ) from error
+    groups = dataset.get("WaveformSequence")
+    if not groups:
+        raise InputError(f"{path}: DICOM without WaveformSequence; it needs an ECG waveform object")
+    # Resting ECGs carry the recording and, beside it, a short averaged beat.
+    index = max(range(len(groups)), key=lambda k: int(groups[k].NumberOfWaveformSamples))
+    return _dicom_group(dataset, index, path)
+
+
+def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
+    """Decode one multiplex group of channels."""
+    group = dataset.WaveformSequence[index]
+    try:
+        signal = np.asarray(dataset.waveform_array(index), dtype=float)
+        channels = list(group.ChannelDefinitionSequence)
+        rate_hz = float(group.SamplingFrequency)
+        names = tuple(_lead_name(channel) for channel in channels)
+        units = [str(c.ChannelSensitivityUnitsSequence[0].CodeValue) for c in channels]
+    except (AttributeError, ValueError, IndexError, KeyError, NotImplementedError) as error:
+        raise InputError(
+            f"{path}: the waveform cannot be decoded ({error}); it needs complete samples, a "
+            "sampling frequency, and a source and a unit for each channel; export it again"
+        ) from error
+    return Ecg(signal * [_millivolts(unit, str(path)) for unit in units], names, rate_hz)
+
+
+def _lead_name(channel: Any) -> str:
+    """``II`` for a channel whose source is coded ``Lead II``."""
+    return str(channel.ChannelSourceSequence[0].CodeMeaning).removeprefix("Lead ").strip()
+
+
+def _millivolts(unit: str, where: str) -> float:
+    """Millivolts in one ``unit``."""
+    name = unit.strip().replace("µ", "u").replace("μ", "u").lower()
+    if name not in MILLIVOLTS:
+        raise InputError(f"{where}: a lead is in {unit!r}; it needs a voltage: V, mV, uV or nV")
+    return MILLIVOLTS[name]
+
+
+def _require_usable(ecg: Ecg, path: Path) -> None:
+    """Refuse leads that hold no heartbeat, naming each of them."""
+    if not ecg.sampling_rate_hz > 0 or not np.isfinite(ecg.sampling_rate_hz):
+        raise InputError(f"{path}: sampling rate is {ecg.sampling_rate_hz} Hz; it must be positive")
+    if not ecg.signal_mv.size:
+        raise InputError(f"{path}: holds no samples; it needs an ECG of several beats")
+    problems = []
+    for name, lead in zip(ecg.leads, ecg.signal_mv.T, strict=True):
+        missing = int((~np.isfinite(lead)).sum())
+        if missing:
+            problems.append(f"lead {name}: {missing} of {len(lead)} samples are not a number")
+        elif np.ptp(lead) == 0:
+            problems.append(f"lead {name}: constant at {lead[0]:g} mV, as of a loose electrode")
+    if problems:
+        what = "; ".join(problems)
+        raise InputError(f"{path}: {what}; leave such leads out of the file, or cut the gaps")

@@ -1,0 +1,143 @@
+"""NIfTI in and out. The files are RAS; everything on this side is LPS and ``(phase, z, y, x)``."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import numpy.typing as npt
+from nibabel.filebasedimages import ImageFileError
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float
+from pipeline.imaging.cine import MIN_PHASES, MIN_SLICES, Cine, Stack, common_phases
+
+LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
+
+
+def read_image(path: Path) -> tuple[npt.NDArray[Any], Float]:
+    """Read a NIfTI file as ``(..., z, y, x)`` and ``mr_from_index`` in LPS millimetres.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or its axes are not at right angles.
+    """
+    image = _load(path)
+    try:
+        stored = np.asarray(image.dataobj)
+    except (OSError, EOFError, ValueError) as error:
+        raise InputError(
+            f"{path}: its voxels cannot be read, the file is truncated or damaged ({error})"
+        ) from error
+    return stored.T, LPS_FROM_RAS @ _right_angled_affine(image, path)
+
+
+def write_image(path: Path, array: npt.NDArray[Any], mr_from_index: Float) -> None:
+    """Write ``(z, y, x)`` or ``(phase, z, y, x)`` as gzipped NIfTI; the same bytes every time."""
+    image = nibabel.Nifti1Image(array.T, LPS_FROM_RAS @ mr_from_index)
+    image.header.set_xyzt_units("mm", "sec")
+    path.write_bytes(gzip.compress(image.to_bytes(), compresslevel=1, mtime=0))
+
+
+def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None) -> Stack:
+    """Read a 4D NIfTI file as a cine stack.
+
+    Parameters
+    ----------
+    timing
+        JSON file ``{"trigger_times_ms": [[per phase] per slice], "rr_ms": [per slice]}``; both
+        may be given once for all slices. Without it, the header's time step is taken: the
+        phases are spread evenly over one heartbeat.
+    rr_ms
+        Overrides the RR interval.
+
+    Raises
+    ------
+    InputError
+        When the file is not a readable 4D image with axes at right angles, too few slices or
+        phases, or no usable timing.
+    """
+    image = _load(path)
+    if len(image.shape) != 4:
+        raise InputError(f"{path}: is not a cine, its shape is {image.shape}; 4D is needed")
+    intensity, mr_from_index = read_image(path)
+    phase_count, slice_count = intensity.shape[:2]
+    if slice_count < MIN_SLICES or phase_count < MIN_PHASES:
+        raise InputError(
+            f"{path}: {slice_count} slices of {phase_count} phases; "
+            f"at least {MIN_SLICES} slices of {MIN_PHASES} phases are needed"
+        )
+    if timing is None:
+        triggers, own_rr_ms = _header_timing(image, path, phase_count, slice_count)
+        source = "NIfTI time step"
+    else:
+        triggers, own_rr_ms = _timing_file(timing, phase_count, slice_count)
+        source = timing.name
+    if rr_ms is not None:
+        own_rr_ms = np.full(slice_count, rr_ms)
+        source = "study.yaml"
+    phases = common_phases(triggers, own_rr_ms, str(timing or path))
+    cine = Cine(
+        np.ascontiguousarray(intensity, np.float32),
+        mr_from_index,
+        phases,
+        float(own_rr_ms.mean()) / 1000,
+    )
+    return Stack(cine, triggers, own_rr_ms, source, ())
+
+
+def _load(path: Path) -> Any:
+    try:
+        return nibabel.load(path)
+    except (ImageFileError, OSError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read as NIfTI ({error})") from error
+
+
+def _right_angled_affine(image: Any, path: Path) -> Float:
+    affine: Float = np.asarray(image.affine, dtype=float)
+    lengths = np.linalg.norm(affine[:3, :3], axis=0)
+    if not np.isfinite(affine).all() or not (lengths > 0).all():
+        raise InputError(f"{path}: its affine is not a placement in space:\n{affine}")
+    axes = affine[:3, :3] / lengths
+    lean = np.abs(axes.T @ axes - np.eye(3)).max()
+    # Single-precision affines of oblique stacks are right-angled to about 1e-6.
+    if lean > 1e-3:
+        raise InputError(
+            f"{path}: its affine is sheared (axes lean by up to "
+            f"{np.degrees(np.arcsin(min(lean, 1))):.2f} degrees); resample the image to a grid "
+            "with axes at right angles"
+        )
+    return affine
+
+
+def _header_timing(image: Any, path: Path, phases: int, slices: int) -> tuple[Float, Float]:
+    unit = image.header.get_xyzt_units()[1]
+    step_ms = 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
+    if not step_ms > 0:
+        raise InputError(
+            f"{path}: has no trigger times: no timing file beside it and no time step in its "
+            'header; write timing.json with "trigger_times_ms" and "rr_ms" beside it'
+        )
+    return np.tile(step_ms * np.arange(phases), (slices, 1)), np.full(slices, step_ms * phases)
+
+
+def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
+    try:
+        content = json.loads(path.read_text())
+        triggers = np.asarray(content["trigger_times_ms"], dtype=float)
+        rr_ms = np.asarray(content["rr_ms"], dtype=float)
+        triggers = np.broadcast_to(triggers, (slices, phases))
+        rr_ms = np.broadcast_to(rr_ms, (slices,))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f'{path}: needs "trigger_times_ms" as {slices} lists of {phases} numbers (or one '
+            f'list) and "rr_ms" as {slices} numbers (or one): {error!r}'
+        ) from error
+    return triggers, rr_ms

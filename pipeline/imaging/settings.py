@@ -1,0 +1,30 @@
+"""Settings of the imaging stages; light to import, so that the command line starts at once."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SegmentSettings(BaseModel):
+    """How the heart is labelled in the images and carried to an isotropic grid."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    phase_blend: float = Field(0.15, ge=0, le=1 / 3)
+    """Share that each neighbouring phase has in a phase's probabilities at 25 phases a beat; with
+    fewer, the share falls as the square of their distance grows, as does what it blurs."""
+
+    min_confidence: float = Field(0.6, ge=0, le=1)
+    """Below this mean probability of the label chosen, a slice counts as not understood."""
+
+    min_ventricle_ml: float = Field(30.0, gt=0)
+    """A left ventricle (cavity and muscle) smaller than this counts as not found."""
+
+    grid_mm: float = Field(1.5, ge=0.5, le=4)
+    """Spacing of the isotropic grid."""
+
+    margin_mm: float = Field(12.0, ge=0)
+    """Empty space kept around the heart on the isotropic grid."""
+
+    correct_shifts: bool = True
+    """Move slices in their plane against breath-hold shifts before they become a volume."""

@@ -1,0 +1,38 @@
+"""What a stage is given to work on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    # For types only: a stage's product must not depend on the settings of other stages.
+    from pipeline.config import Settings
+    from pipeline.study import Study
+
+
+class Skipped(Exception):
+    """Raised by a stage that has nothing to do in this study; says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One stage's share of a run."""
+
+    study: Study
+    settings: Settings
+    products: Path
+    """Where the finished stages lie, each in a folder of its name."""
+
+    folder: Path
+    """Where this stage writes."""
+
+    progress: Callable[[int, int], None]
+    """Told how much is done, of how much."""
+
+    def product(self, stage: str) -> Path | None:
+        """The folder of a finished stage, or None where it was skipped."""
+        path = self.products / stage
+        return path if path.is_dir() else None

@@ -1,0 +1,208 @@
+"""Bake closed surfaces of one's own, from CT or any other tool, without the stages before."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline import __version__
+from pipeline.config import Settings
+from pipeline.errors import InputError
+from pipeline.field.bake import SurfaceSeries, bake_field
+from pipeline.field.distance import require_closed
+from pipeline.field.fixture import Fixture
+from pipeline.meshes import MESH_ENDINGS, read_mesh
+from pipeline.publish import only_run_in, publishing, sha256_of
+from pipeline.study import describe_validation
+
+Row = tuple[float, float, float, float]
+Transform = tuple[Row, Row, Row, Row]
+
+NUMBERED = re.compile(r"(?P<structure>.+)_(?P<number>\d+)")
+
+
+class Timing(BaseModel):
+    """What ``phases.json`` beside the surfaces may say."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    phases: tuple[float, ...] | None = None
+    """Rising within [0, 1), one a file; evenly spaced from 0 when left out."""
+
+    rr_s: float | None = Field(default=None, gt=0)
+    """Mean duration of a heartbeat."""
+
+    mr_from_tracker: Transform | None = None
+    """4x4, where a tracker is registered to the surfaces' frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSurfaces:
+    """What a folder of surfaces holds."""
+
+    surfaces: dict[str, SurfaceSeries]
+    """By structure."""
+
+    timing: Timing
+    """As given, phases resolved."""
+
+    digests: dict[str, str]
+    """SHA-256 of every surface file."""
+
+
+def bake_own_surfaces(
+    folder: Path,
+    out: Path,
+    settings: Settings,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Bake the surfaces in a folder into ``out/field.zarr``, whole or not at all; return it.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be used, a fixture's surface is missing, or ``out`` not written.
+    """
+    own = read_own_surfaces(folder)
+    field = out / "field.zarr"
+    transform = own.timing.mr_from_tracker
+    with only_run_in(out), publishing(field) as partial:
+        # The store makes its own folder.
+        partial.rmdir()
+        bake_field(
+            partial,
+            own.surfaces,
+            _fixtures_for(own.surfaces, settings),
+            settings.bake,
+            mr_from_tracker=None if transform is None else np.array(transform),
+            rr_s=own.timing.rr_s,
+            source={"surfaces": own.digests, "beatfield": __version__},
+            progress=progress,
+        )
+    return field
+
+
+def _fixtures_for(surfaces: Collection[str], settings: Settings) -> dict[str, Fixture]:
+    """The fixtures that a configuration asks for.
+
+    Where none is asked for, every surface gets one: its default fixtures if it has any, or a
+    guidance to it.
+    """
+    if "fixtures" in settings.model_fields_set:
+        return settings.fixtures
+    chosen = {name: one for name, one in settings.fixtures.items() if one.structure in surfaces}
+    covered = {one.structure for one in chosen.values()}
+    return chosen | {
+        f"{name}_guidance": Fixture(structure=name, kind="guidance", gamma_mm=3.0, m=2, f_max_n=2.0)
+        for name in surfaces
+        if name not in covered
+    }
+
+
+def read_own_surfaces(folder: Path) -> OwnSurfaces:
+    """Read ``<structure>_000.vtp``, ``<structure>_001.vtp`` ... or ``<structure>/000.vtp`` ...
+
+    One file a phase, VTP, STL or PLY, in LPS mm, closed, normals outwards. A structure with a
+    single file, numbered or not, does not move. Triangles may differ between phases.
+
+    Raises
+    ------
+    InputError
+        When there are none, numbers do not run from 0, phases disagree, or a surface cannot be
+        read, is open, or faces inwards. Nothing is repaired.
+    """
+    files = _files_by_structure(folder)
+    counts = {name: len(paths) for name, paths in files.items()}
+    phase_count = max(counts.values())
+    odd = [f"{name} has {n}" for name, n in counts.items() if n not in (1, phase_count)]
+    if odd:
+        raise InputError(
+            f"{folder}: {', '.join(odd)} and another {phase_count} files; every structure needs "
+            "one a phase, or a single one if it does not move"
+        )
+    timing = _timing(folder / "phases.json", phase_count)
+    phases = np.array(timing.phases)
+    series = {}
+    for name, paths in files.items():
+        each = [_closed(path) for path in paths]
+        # The same object for every phase of a structure that rests costs nothing.
+        series[name] = SurfaceSeries(tuple(each * (phase_count // len(each))), phases)
+    digests = {
+        path.relative_to(folder).as_posix(): sha256_of(path)
+        for paths in files.values()
+        for path in paths
+    }
+    return OwnSurfaces(series, timing, digests)
+
+
+def _closed(path: Path) -> Any:
+    surface = read_mesh(path)
+    require_closed(surface, str(path))
+    return surface
+
+
+def _files_by_structure(folder: Path) -> dict[str, list[Path]]:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give one that holds closed surfaces")
+    found: dict[str, dict[int, Path]] = {}
+    for path in sorted([*folder.iterdir(), *folder.glob("*/*")]):
+        if path.suffix.lower() not in MESH_ENDINGS or not path.is_file():
+            continue
+        structure, number = _place(folder, path)
+        phases = found.setdefault(structure, {})
+        if number in phases:
+            raise InputError(f"{path}: {phases[number]} is the same structure and phase; keep one")
+        phases[number] = path
+    if not found:
+        raise InputError(
+            f"{folder}: holds no {', '.join(MESH_ENDINGS)} files; name them STRUCTURE_000.vtp, "
+            "STRUCTURE_001.vtp ..., one a phase"
+        )
+    for structure, phases in found.items():
+        missing = sorted(set(range(len(phases))) - set(phases))
+        if missing:
+            raise InputError(
+                f"{folder}: {structure} has {len(phases)} files, but none numbered {missing[0]}; "
+                "number the phases 0, 1, 2 ... without a gap"
+            )
+    return {name: [phases[k] for k in sorted(phases)] for name, phases in found.items()}
+
+
+def _place(folder: Path, path: Path) -> tuple[str, int]:
+    """Structure and phase number of a file, from its name or its folder's."""
+    if path.parent != folder:
+        if not path.stem.isdecimal():
+            raise InputError(f"{path}: in a structure's folder, name files 000, 001 ... by phase")
+        return path.parent.name, int(path.stem)
+    numbered = NUMBERED.fullmatch(path.stem)
+    if numbered:
+        return numbered["structure"], int(numbered["number"])
+    return path.stem, 0
+
+
+def _timing(path: Path, phase_count: int) -> Timing:
+    timing = _read_timing(path) if path.exists() else Timing()
+    if timing.phases is None:
+        evenly = tuple(k / phase_count for k in range(phase_count))
+        return timing.model_copy(update={"phases": evenly})
+    if len(timing.phases) != phase_count:
+        raise InputError(
+            f"{path}: {len(timing.phases)} phases for {phase_count} surfaces; give one each"
+        )
+    return timing
+
+
+def _read_timing(path: Path) -> Timing:
+    try:
+        return Timing.model_validate(json.loads(path.read_bytes()))
+    except ValidationError as error:
+        raise InputError(describe_validation(error, str(path))) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error

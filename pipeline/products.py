@@ -1,0 +1,140 @@
+"""What the stages leave for one another on disk, in and out."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.geometry import Float, Label, MovingSurface, Surface
+from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.nifti import read_image, write_image
+from pipeline.meshes import read_mesh, write_vtp
+
+
+def write_cine(folder: Path, stack: Stack) -> None:
+    """``cine.nii.gz`` and ``phases.json``."""
+    cine = stack.cine
+    write_image(folder / "cine.nii.gz", _compact(cine.intensity), cine.mr_from_index)
+    write_table(
+        folder / "phases.json",
+        {
+            "phases": cine.phases.tolist(),
+            "rr_s": cine.rr_s,
+            "trigger_times_ms": stack.trigger_times_ms.tolist(),
+            "rr_ms": stack.rr_ms.tolist(),
+            "timing_source": stack.timing_source,
+            "left_out": list(stack.left_out),
+        },
+    )
+
+
+def read_cine(folder: Path) -> Cine:
+    """What ``write_cine`` wrote."""
+    intensity, mr_from_index = read_image(folder / "cine.nii.gz")
+    timing = read_table(folder / "phases.json")
+    return Cine(
+        np.ascontiguousarray(intensity, np.float32),
+        mr_from_index,
+        np.array(timing["phases"]),
+        float(timing["rr_s"]),
+    )
+
+
+def _compact(intensity: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+    """Whole numbers as 16-bit integers, as scanners store them; other values as they are."""
+    limits = np.iinfo(np.int16)
+    whole = np.rint(intensity)
+    fits = whole.min() >= limits.min and whole.max() <= limits.max
+    return whole.astype(np.int16) if fits and np.array_equal(whole, intensity) else intensity
+
+
+def write_labels(folder: Path, stem: str, labels: Label, mr_from_index: Float) -> None:
+    """``<stem>_000.nii.gz`` ..., one file a phase, from ``(phase, z, y, x)``."""
+    for number, volume in enumerate(labels):
+        write_image(folder / f"{stem}_{number:03d}.nii.gz", volume, mr_from_index)
+
+
+def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
+    """``(phase, z, y, x)`` labels and ``mr_from_index``."""
+    volumes = [read_image(path) for path in sorted(folder.glob(f"{stem}_*.nii.gz"))]
+    return np.stack([np.asarray(volume, np.uint8) for volume, _ in volumes]), volumes[0][1]
+
+
+def write_surfaces(folder: Path, surfaces: Mapping[str, MovingSurface]) -> None:
+    """``<structure>_000.vtp`` ..., one file a structure and phase."""
+    for name, moving in surfaces.items():
+        for number in range(len(moving.phases)):
+            write_vtp(folder / f"{name}_{number:03d}.vtp", moving.at(number))
+
+
+def read_surfaces(folder: Path, phases: Float) -> dict[str, MovingSurface]:
+    """What ``write_surfaces`` wrote, by structure."""
+    names = sorted({path.stem.rsplit("_", 1)[0] for path in folder.glob("*.vtp")})
+    return {name: _read_moving(folder, name, phases) for name in names}
+
+
+def _read_moving(folder: Path, name: str, phases: Float) -> MovingSurface:
+    each: list[Surface] = [
+        read_mesh(folder / f"{name}_{number:03d}.vtp") for number in range(len(phases))
+    ]
+    vertices_mm = np.stack([surface.vertices_mm for surface in each])
+    return MovingSurface(vertices_mm, each[0].triangles, phases)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """One tracked frame as ``frames.csv`` lists it."""
+
+    sweep: str
+    frame: int
+    time_s: float
+    phase: float
+    residual: float
+    valid: bool
+
+
+def write_frames(path: Path, rows: Sequence[FrameRow]) -> None:
+    """``frames.csv``: per US frame its time, phase, residual, and whether it counted."""
+    with path.open("w", newline="") as handle:
+        table = csv.writer(handle, lineterminator="\n")
+        table.writerow(FrameRow.__slots__)
+        for row in rows:
+            table.writerow([row.sweep, row.frame, *_rounded(row), int(row.valid)])
+
+
+def _rounded(row: FrameRow) -> list[str]:
+    return [f"{value:.6f}" for value in (row.time_s, row.phase, row.residual)]
+
+
+def read_frames(path: Path) -> list[FrameRow]:
+    """What ``write_frames`` wrote."""
+    with path.open(newline="") as handle:
+        return [
+            FrameRow(
+                row["sweep"],
+                int(row["frame"]),
+                float(row["time_s"]),
+                float(row["phase"]),
+                float(row["residual"]),
+                bool(int(row["valid"])),
+            )
+            for row in csv.DictReader(handle)
+        ]
+
+
+def write_table(path: Path, content: Mapping[str, Any]) -> None:
+    """A small JSON file, readable by people too."""
+    path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """What ``write_table`` wrote."""
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content

@@ -1,0 +1,242 @@
+"""Products published whole or not at all, and known by the content that made them.
+
+A stage writes into a hidden folder beside its place; only when it is complete is that folder
+renamed. ``stage.json`` in it carries the fingerprint of all that went in (inputs, settings,
+code) and every file's digest, so a later run can tell whether the product still holds.
+"""
+
+from __future__ import annotations
+
+import ast
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import InputError
+
+STAGE_FILE = "stage.json"
+PARTIAL = ".partial-"
+
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "scikit-image",
+    "SimpleITK",
+    "opencv-contrib-python-headless",
+    "pyvista",
+    "numba",
+    "zarr",
+)
+
+NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+PACKAGE = Path(__file__).parent
+
+
+@contextmanager
+def publishing(target: Path) -> Iterator[Path]:
+    """Give a folder to write in; on leaving without an error it becomes ``target``.
+
+    Raises
+    ------
+    InputError
+        When the disk is full or the place cannot be written. Nothing is left behind then, and
+        what stood at ``target`` before is untouched.
+    """
+    partial = target.with_name(f".{target.name}{PARTIAL}{os.getpid()}")
+    with readable_write_errors(target):
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            remove(partial)
+            partial.mkdir()
+            yield partial
+            _swap(partial, target)
+        finally:
+            remove(partial)
+
+
+@contextmanager
+def readable_write_errors(target: Path) -> Iterator[None]:
+    """Turn the system's refusal to write into words for the user."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise InputError(
+                f"{target}: the disk is full ({error.strerror}); free some space or choose "
+                "another --out, then run again: finished stages are kept"
+            ) from error
+        if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST}:
+            raise InputError(
+                f"{target}: cannot be written ({error.strerror}: {error.filename}); "
+                "choose a folder that you may write in"
+            ) from error
+        raise
+
+
+def _swap(partial: Path, target: Path) -> None:
+    """Put ``partial`` in the place of ``target``; a folder cannot be renamed over another."""
+    old = target.with_name(f".{target.name}{PARTIAL}old-{os.getpid()}")
+    if target.exists():
+        target.rename(old)
+    partial.rename(target)
+    remove(old)
+
+
+def remove(path: Path) -> None:
+    """Delete a folder or file, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_partials(folder: Path) -> None:
+    """Clear away what a killed run left unfinished."""
+    for path in folder.glob(f".*{PARTIAL}*"):
+        remove(path)
+
+
+@contextmanager
+def only_run_in(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; the system lets go of it however the process ends.
+
+    Raises
+    ------
+    InputError
+        When another run is at work in the folder, or it cannot be written.
+    """
+    with readable_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / ".lock").open("w")
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: another run is at work here; wait for it, or choose another --out"
+            ) from error
+        remove_partials(folder)
+        yield
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all."""
+    partial = path.with_name(f".{path.name}{PARTIAL}{os.getpid()}")
+    with readable_write_errors(path):
+        try:
+            partial.write_text(json.dumps(content, indent=1) + "\n")
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def seal(folder: Path, fingerprint: str, figures: Mapping[str, Any]) -> None:
+    """Write ``stage.json``: what went in, what was measured, and every file's digest."""
+    files = {
+        path.relative_to(folder).as_posix(): {
+            "bytes": path.stat().st_size,
+            "sha256": sha256_of(path),
+        }
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+    write_json(
+        folder / STAGE_FILE,
+        {"fingerprint": fingerprint, "figures": dict(figures), "files": files},
+    )
+
+
+def sealed(folder: Path) -> dict[str, Any] | None:
+    """What ``stage.json`` says, or None where a file of the product is missing or cut short."""
+    try:
+        content: dict[str, Any] = json.loads((folder / STAGE_FILE).read_text())
+        intact = all(
+            (folder / name).stat().st_size == entry["bytes"]
+            for name, entry in content["files"].items()
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content if intact else None
+
+
+def fingerprint(parts: Mapping[str, Any]) -> str:
+    """SHA-256 of JSON-able parts; order counts, as it does for fixtures, whose first leads."""
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hexadecimal."""
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that shape the products."""
+    return {name: metadata.version(name) for name in LIBRARIES}
+
+
+@cache
+def code_digest(module: str) -> str:
+    """Digest of a module of the pipeline and of all that it imports from the pipeline.
+
+    Imports inside functions count, those for types alone do not. Data files beside the imported
+    modules (network weights, page templates) count, since they decide the result as code does.
+    """
+    digest = hashlib.sha256()
+    paths = _import_closure(module)
+    data = {
+        path
+        for folder in {path.parent for path in paths} - {PACKAGE}
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix not in {".py", ".pyc", ".nbi", ".nbc"}
+    }
+    for path in sorted(paths | data):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _import_closure(module: str) -> set[Path]:
+    found: set[Path] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = _source_of(name)
+        if path is None or path in found:
+            continue
+        found.add(path)
+        waiting += _pipeline_imports(path)
+    return found
+
+
+def _source_of(module: str) -> Path | None:
+    base = PACKAGE.joinpath(*module.split(".")[1:])
+    return next(
+        (one for one in (base.with_suffix(".py"), base / "__init__.py") if one.exists()), None
+    )
+
+
+def _pipeline_imports(path: Path) -> list[str]:
+    names: list[str] = []
+    waiting: list[ast.AST] = [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        waiting += ast.iter_child_nodes(node)
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.append(node.module)
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return [name for name in names if name.split(".")[0] == "pipeline"]

@@ -1,0 +1,252 @@
+"""Turn tracked ultrasound frames into samples that can be compared with the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.ndimage import binary_closing, binary_fill_holes
+from scipy.sparse import csr_array
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float, Float32, Integer, Mask
+
+TREND_COLUMNS = 6
+"""Polynomials of degree 2 in two coordinates."""
+
+
+class TrackedSweep(Protocol):
+    """What registration needs of a sweep."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def images(self) -> Float32:
+        """``(n, h, w)`` grey values, 0 outside the sector."""
+
+    @property
+    def tracker_from_image(self) -> Float:
+        """``(n, 4, 4)``: pixel ``(i, j, 0)`` (column, row) to tracker millimetres."""
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacedSweep:
+    """A sweep whose pictures stand in the wrong place; see `mirrored` and `backwards`."""
+
+    name: str
+    images: Float32
+    tracker_from_image: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Smoothed grey values of all frames at points in tracker space, frame after frame."""
+
+    points_mm: Float32
+    """``(samples, 3)`` tracker millimetres."""
+
+    grey: Float32
+    """``(samples,)``: of mean 0 in each frame, free of its trend, of variance 1."""
+
+    trend: Float32
+    """``(samples, TREND_COLUMNS)``: orthonormal in each frame; what grey values may do for no
+    reason of the heart: gain, and shadow towards one side."""
+
+    first: Integer
+    """``(frames + 1,)``: frame k has the samples from ``first[k]`` up to ``first[k + 1]``."""
+
+    phases: Float
+    """``(frames,)`` in [0, 1)."""
+
+    number: Integer
+    """``(frames,)``: place of the frame in the study, counted through all sweeps."""
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return len(self.phases)
+
+
+def sample_frames(
+    sweeps: Sequence[TrackedSweep],
+    phases: Sequence[Float],
+    spacing_mm: float,
+    smoothing_mm: float,
+) -> Samples:
+    """Samples of every frame whose pose is known and whose picture is not flat.
+
+    Parameters
+    ----------
+    sweeps, phases
+        The sweeps and, for each, the ``(n,)`` phases of its frames.
+    spacing_mm
+        Distance between samples in the plane of a frame.
+    smoothing_mm
+        Standard deviation of the Gaussian that takes out speckle.
+
+    Raises
+    ------
+    InputError
+        When phases do not belong to the frames, a sweep shows no sector, or its transform does
+        not map pixels to millimetres.
+    """
+    parts: list[Samples] = []
+    offset = 0
+    for sweep, own in zip(sweeps, phases, strict=True):
+        _require_sweep(sweep, own)
+        part = _sample_sweep(sweep, own, spacing_mm, smoothing_mm)
+        parts.append(replace(part, number=part.number + offset))
+        offset += len(own)
+    return _join(parts)
+
+
+def mirrored(sweep: TrackedSweep) -> DisplacedSweep:
+    """The sweep with left and right exchanged: the same pictures and sector, no anatomy."""
+    columns = np.flatnonzero(_sector(sweep).any(axis=0))
+    swap = np.eye(4)
+    swap[0, 0], swap[0, 3] = -1, columns[0] + columns[-1]
+    return DisplacedSweep(f"{sweep.name} mirrored", sweep.images, sweep.tracker_from_image @ swap)
+
+
+def backwards(sweep: TrackedSweep) -> DisplacedSweep:
+    """The sweep with its pictures in reverse order: each at the pose and phase of another."""
+    return DisplacedSweep(f"{sweep.name} backwards", sweep.images[::-1], sweep.tracker_from_image)
+
+
+def choose(samples: Samples, frames: Integer) -> Samples:
+    """Only the frames ``frames`` (rising), in that order."""
+    counts = np.diff(samples.first)[frames]
+    first = np.concatenate([[0], np.cumsum(counts)])
+    start = np.repeat(samples.first[frames] - first[:-1], counts)
+    rows = np.arange(first[-1]) + start
+    return Samples(
+        samples.points_mm[rows],
+        samples.grey[rows],
+        samples.trend[rows],
+        first,
+        samples.phases[frames],
+        samples.number[frames],
+    )
+
+
+def _require_sweep(sweep: TrackedSweep, phases: Float) -> None:
+    count = len(sweep.images)
+    if sweep.images.ndim != 3 or sweep.tracker_from_image.shape != (count, 4, 4):
+        raise InputError(
+            f"{sweep.name}: needs images (n, h, w) and transforms (n, 4, 4), got "
+            f"{sweep.images.shape} and {sweep.tracker_from_image.shape}"
+        )
+    if phases.shape != (count,) or not ((phases >= 0) & (phases < 1)).all():
+        raise InputError(
+            f"{sweep.name}: needs {count} phases in [0, 1), one a frame, got {phases.shape}"
+        )
+
+
+def _sample_sweep(
+    sweep: TrackedSweep, phases: Float, spacing_mm: float, smoothing_mm: float
+) -> Samples:
+    """Samples of one sweep; its frames share the pixels that are looked at."""
+    pixel_mm = _pixel_size_mm(sweep)
+    sector = _sector(sweep)
+    at = _lattice(sector, pixel_mm, spacing_mm)
+    smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
+    seen = (smoothing @ sweep.images.reshape(len(sweep.images), -1).T).T
+    trend = _trend(at * pixel_mm)
+    grey = seen - (seen @ trend) @ trend.T
+    spread = grey.std(axis=1)
+    # A flat picture (the probe in air, a dead frame) has rounding errors for contrast.
+    lively = spread > 1e-3 * max(float(sweep.images.max()), 1e-30)
+    kept = np.flatnonzero(np.isfinite(sweep.tracker_from_image).all(axis=(1, 2)) & lively)
+    pixels = np.column_stack([at, np.zeros(len(at)), np.ones(len(at))])
+    points = np.einsum("fij,sj->fsi", sweep.tracker_from_image[kept, :3], pixels)
+    return Samples(
+        points.reshape(-1, 3).astype(np.float32),
+        (grey[kept] / spread[kept, None]).reshape(-1).astype(np.float32),
+        np.tile(trend, (len(kept), 1)).astype(np.float32),
+        np.arange(len(kept) + 1) * len(at),
+        phases[kept],
+        kept,
+    )
+
+
+def _pixel_size_mm(sweep: TrackedSweep) -> Float:
+    """Width and height of a pixel."""
+    axes = sweep.tracker_from_image[:, :3, :2]
+    usable = axes[np.isfinite(sweep.tracker_from_image).all(axis=(1, 2))]
+    if len(usable) == 0:
+        raise InputError(f"{sweep.name}: no frame has a finite pose; was the probe tracked?")
+    size_mm = np.linalg.norm(usable, axis=1)
+    middle = np.median(size_mm, axis=0)
+    if not np.allclose(size_mm, middle, rtol=1e-2) or not (middle > 0).all():
+        raise InputError(
+            f"{sweep.name}: pixels measure from {size_mm.min():.4g} to {size_mm.max():.4g} mm; "
+            "needs one size above 0 for all frames: is ImageToProbe right?"
+        )
+    return np.asarray(middle)
+
+
+def _sector(sweep: TrackedSweep) -> Mask:
+    """Where the sweep ever shows anything, ``(h, w)``; dark blood inside counts as shown."""
+    shown = np.isfinite(sweep.images).all(axis=0) & (sweep.images.max(axis=0) > 0)
+    sector = binary_fill_holes(binary_closing(shown, iterations=3) | shown)
+    if sector is None or sector.mean() < 0.02:
+        raise InputError(
+            f"{sweep.name}: only {shown.mean():.1%} of the pixels ever show anything; "
+            "needs grey values with a sector in view"
+        )
+    return np.asarray(sector, dtype=bool)
+
+
+def _lattice(sector: Mask, pixel_mm: Float, spacing_mm: float) -> Integer:
+    """Columns and rows of the pixels that are looked at, ``(samples, 2)``."""
+    step = np.maximum(1, np.round(spacing_mm / pixel_mm)).astype(int)
+    rows, columns = np.mgrid[
+        step[1] // 2 : sector.shape[0] : step[1], step[0] // 2 : sector.shape[1] : step[0]
+    ]
+    inside = sector[rows, columns]
+    return np.stack([columns[inside], rows[inside]], axis=1)
+
+
+def _smoothing(sector: Mask, at: Integer, pixel_mm: Float, sigma_mm: float) -> csr_array:
+    """Gaussian means over the sector around each lattice point, ``(samples, h * w)``."""
+    reach = np.ceil(2.5 * sigma_mm / pixel_mm).astype(int)
+    di, dj = np.meshgrid(
+        np.arange(-reach[0], reach[0] + 1), np.arange(-reach[1], reach[1] + 1), indexing="xy"
+    )
+    weight = np.exp(-0.5 * ((di * pixel_mm[0]) ** 2 + (dj * pixel_mm[1]) ** 2) / sigma_mm**2)
+    i = at[:, 0, None] + di.ravel()
+    j = at[:, 1, None] + dj.ravel()
+    height, width = sector.shape
+    inside = (i >= 0) & (i < width) & (j >= 0) & (j < height)
+    inside &= sector[np.clip(j, 0, height - 1), np.clip(i, 0, width - 1)]
+    weights = np.where(inside, weight.ravel(), 0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(len(at)), weights.shape[1])[inside.ravel()]
+    columns = (j * width + i)[inside]
+    shape = (len(at), height * width)
+    return csr_array((weights[inside].astype(np.float32), (rows, columns)), shape=shape)
+
+
+def _trend(position_mm: Float) -> Float:
+    """Orthonormal columns that span the polynomials of degree 2 in the plane of the frame."""
+    size_mm = np.maximum(np.ptp(position_mm, axis=0), 1e-9)
+    x, y = ((position_mm - position_mm.mean(axis=0)) / size_mm).T
+    columns = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    return np.asarray(np.linalg.qr(columns)[0])
+
+
+def _join(parts: Sequence[Samples]) -> Samples:
+    """The samples of several sweeps, one after the other."""
+    counts = np.concatenate([np.diff(part.first) for part in parts])
+    return Samples(
+        np.concatenate([part.points_mm for part in parts]),
+        np.concatenate([part.grey for part in parts]),
+        np.concatenate([part.trend for part in parts]),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.concatenate([part.phases for part in parts]),
+        np.concatenate([part.number for part in parts]),
+    )

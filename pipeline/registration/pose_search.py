@@ -1,0 +1,104 @@
+"""Find the rigid pose at which frames and model agree best: first roughly, then finely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from pipeline.geometry import Float, MovingSurface, transform_points
+
+# The published types of this function leave out options of single methods.
+_minimize: Any = minimize
+
+Score = Callable[[Float], float]
+"""Agreement at a pose ``mr_from_tracker``; more is better."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pivot:
+    """The point and the lever that make rotations and shifts comparable."""
+
+    centre_mm: Float
+    """``(3,)`` what is turned about: the middle of the heart."""
+
+    lever_mm: float
+    """Root mean square distance of the heart from it: a turn by angle a moves it by a levers."""
+
+    def move(self, mr_from_tracker: Float, step_mm: Float) -> Float:
+        """The pose shifted by ``step_mm[:3]`` and turned by the rotation vector
+        ``step_mm[3:] / lever``, both in the MR frame."""
+        rotation = Rotation.from_rotvec(step_mm[3:] / self.lever_mm).as_matrix()
+        motion = np.eye(4)
+        motion[:3, :3] = rotation
+        motion[:3, 3] = self.centre_mm - rotation @ self.centre_mm + step_mm[:3]
+        return np.asarray(motion @ mr_from_tracker)
+
+    def distance(self, pose: Float, other: Float) -> tuple[float, float]:
+        """How far two poses lie apart: shift of the pivot in millimetres, and degrees."""
+        motion = pose @ np.linalg.inv(other)
+        shift = transform_points(motion, self.centre_mm) - self.centre_mm
+        angle = Rotation.from_matrix(motion[:3, :3]).magnitude()
+        return float(np.linalg.norm(shift)), float(np.degrees(angle))
+
+
+def pivot_of(surfaces: Sequence[MovingSurface]) -> Pivot:
+    """The middle and the size of what the surfaces enclose, over the beat."""
+    points = np.concatenate([surface.vertices_mm.reshape(-1, 3) for surface in surfaces])
+    centre_mm = points.mean(axis=0)
+    return Pivot(centre_mm, float(np.sqrt(((points - centre_mm) ** 2).sum(axis=1).mean())))
+
+
+def poses_around(
+    pose: Float, pivot: Pivot, reach_mm: float, reach_deg: float, count: int, seed: int
+) -> list[Float]:
+    """The pose itself and ``count - 1`` others up to the given shift and rotation away."""
+    rng = np.random.default_rng(seed)
+    reach = np.repeat([reach_mm, np.radians(reach_deg) * pivot.lever_mm], 3)
+    poses = [pose]
+    while len(poses) < count:
+        directions = rng.normal(size=(2, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        # The cube root would spread evenly over the ball; the start is worth more than its rim.
+        lengths = np.repeat(rng.uniform(size=2), 3)
+        poses.append(pivot.move(pose, reach * lengths * directions.ravel()))
+    return poses
+
+
+def climb_from_best(score: Score, candidates: list[Float], pivot: Pivot, starts: int) -> Float:
+    """The best pose reached, to about a millimetre, from the ``starts`` best candidates."""
+    ranked = sorted(candidates, key=score, reverse=True)[:starts]
+    reached = [climb(score, pose, pivot, step_mm=1.0, flatness=4e-3) for pose in ranked]
+    return max(reached, key=score)
+
+
+def climb(
+    score: Score, pose: Float, pivot: Pivot, step_mm: float = 0.3, flatness: float = 1e-3
+) -> Float:
+    """The optimum of a smooth score uphill of ``pose`` (BFGS).
+
+    Parameters
+    ----------
+    step_mm
+        Half the width of the differences that give the slope: wide enough to look past the kinks
+        that linear interpolation leaves at every node.
+    flatness
+        Slope, in score a millimetre, at which to stop: 1e-3 is some hundredths of a millimetre
+        from the optimum of a score near 1 that fades over 5 mm.
+    """
+
+    def loss(motion_mm: Float) -> float:
+        return -score(pivot.move(pose, motion_mm))
+
+    def slope(motion_mm: Float) -> Float:
+        rise = [loss(motion_mm + d) - loss(motion_mm - d) for d in step_mm * np.eye(6)]
+        return np.array(rise) / (2 * step_mm)
+
+    # Such a score bends by about 1 / 30 a square millimetre: so far does the first step trust it.
+    options = {"gtol": flatness, "hess_inv0": 30.0 * np.eye(6)}
+    found = _minimize(loss, np.zeros(6), method="BFGS", jac=slope, options=options)
+    return pivot.move(pose, np.asarray(found.x))

@@ -1,0 +1,65 @@
+"""One self-contained page: sections of text, tables and pictures, through a template."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "webp": "image/webp"}
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An image inside the page itself."""
+
+    caption: str
+    source: str
+    """A ``data:`` address."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text under a head."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading, a sentence or two, and what there is to see."""
+
+    title: str
+    text: str
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+
+
+def picture(caption: str, content: bytes, kind: str) -> Picture:
+    """Embed an image; ``kind`` is png, svg or webp."""
+    coded = base64.b64encode(content).decode()
+    return Picture(caption, f"data:{MEDIA_TYPES[kind]};base64,{coded}")
+
+
+def render(
+    patient_id: str,
+    summary: Sequence[tuple[str, str]],
+    sections: Sequence[Section],
+    example: Mapping[str, Any],
+    notes: Sequence[str] = (),
+) -> str:
+    """The page as HTML; text is escaped."""
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+    )
+    return templates.get_template("page.html.j2").render(
+        patient_id=patient_id, summary=summary, sections=sections, example=example, notes=notes
+    )

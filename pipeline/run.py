@@ -1,0 +1,260 @@
+"""The stages of a study, in order.
+
+A stage whose inputs, settings and code have not changed is not run again; an interrupted run
+goes on from the first stage that is not finished.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipeline.config import Settings
+from pipeline.errors import BeatfieldError, InputError
+from pipeline.job import Job, Skipped
+from pipeline.memory import PeakMemory
+from pipeline.publish import (
+    code_digest,
+    fingerprint,
+    library_versions,
+    only_run_in,
+    publishing,
+    remove,
+    seal,
+    sealed,
+    sha256_of,
+    write_json,
+)
+from pipeline.study import Study
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What a stage depends on, so that a change anywhere else leaves its product standing."""
+
+    name: str
+    after: tuple[str, ...] = ()
+    """Stages whose products it reads."""
+
+    inputs: tuple[str, ...] = ()
+    """Kinds of study files it reads: cine, mr_ecg, us, truth."""
+
+    settings: tuple[str, ...] = ()
+    """Sections of the settings it reads."""
+
+
+STAGES = (
+    Stage("ingest", inputs=("cine", "mr_ecg")),
+    Stage("segment", after=("ingest",), settings=("segment",)),
+    Stage("surface", after=("ingest", "segment"), settings=("surface",)),
+    Stage("register", after=("surface",), inputs=("us",), settings=("register",)),
+    Stage("bake", after=("ingest", "surface", "register"), settings=("bake", "fixtures")),
+    Stage("evaluate", after=("segment", "surface", "register", "bake"), inputs=("truth",)),
+    Stage(
+        "report",
+        after=("ingest", "segment", "surface", "register", "bake", "evaluate"),
+        inputs=("us",),
+        settings=("fixtures",),
+    ),
+)
+
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+class Watcher(Protocol):
+    """Whoever shows the user how the run goes."""
+
+    def started(self, stage: str) -> None:
+        """A stage begins."""
+
+    def progress(self, done: int, total: int) -> None:
+        """The stage in flight has done this much."""
+
+    def ended(self, stage: str, outcome: str, seconds: float) -> None:
+        """A stage ended: done, unchanged, skipped or failed."""
+
+
+@dataclass(slots=True)
+class _Run:
+    study: Study
+    settings: Settings
+    products: Path
+    watcher: Watcher
+    inputs: dict[str, dict[str, str]]
+    before: Mapping[str, Any]
+    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def run_study(
+    study: Study,
+    settings: Settings,
+    out: Path,
+    watcher: Watcher,
+    first: str | None = None,
+    last: str | None = None,
+) -> dict[str, Any]:
+    """Run a study's stages; return what ``run.json`` says.
+
+    Parameters
+    ----------
+    out
+        Products go to ``out/<patient id>/``.
+    first
+        This stage and those after it run even if nothing changed.
+    last
+        The run ends after this stage.
+
+    Raises
+    ------
+    InputError, StageError
+        As the stage that failed says; ``run.json`` records it, and finished stages stay.
+    """
+    products = out / study.patient_id
+    if products.resolve().is_relative_to(study.folder):
+        raise InputError(f"{out}: lies inside the study; choose a folder outside {study.folder}")
+    wanted = STAGES[: STAGE_NAMES.index(last) + 1] if last else STAGES
+    forced = STAGE_NAMES[STAGE_NAMES.index(first) :] if first else ()
+    with only_run_in(products):
+        inputs = _input_digests(study)
+        run = _Run(study, settings, products, watcher, inputs, _previous(products))
+        for stage in wanted:
+            _bring_up_to_date(run, stage, force=stage.name in forced)
+        _note_later_products(run, STAGES[len(wanted) :])
+        return _record(run, "done")
+
+
+def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
+    key = _fingerprint(run, stage)
+    target = run.products / stage.name
+    standing = sealed(target)
+    if standing and standing["fingerprint"] == key and not force:
+        run.watcher.ended(stage.name, "unchanged", 0.0)
+        _note(run, stage.name, "done", standing["figures"], key, None)
+        return
+    run.watcher.started(stage.name)
+    clock, memory = time.perf_counter(), PeakMemory()
+    try:
+        figures = _execute(run, stage, target, key)
+    except Skipped as reason:
+        remove(target)
+        run.watcher.ended(stage.name, f"skipped: {reason}", 0.0)
+        run.stages[stage.name] = {"status": "skipped", "cause": str(reason)}
+        return
+    except BeatfieldError as error:
+        run.stages[stage.name] = {"status": "failed", "cause": str(error)}
+        run.watcher.ended(stage.name, "failed", time.perf_counter() - clock)
+        _record(run, "failed")
+        raise
+    seconds = time.perf_counter() - clock
+    measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}
+    _note(run, stage.name, "done", figures, key, measured)
+    _record(run, "running")
+    run.watcher.ended(stage.name, "done", seconds)
+
+
+def _note_later_products(run: _Run, later: tuple[Stage, ...]) -> None:
+    """Say of products beyond the last stage asked for whether they still hold."""
+    for stage in later:
+        standing = sealed(run.products / stage.name)
+        if standing is None:
+            continue
+        key = _fingerprint(run, stage)
+        current = standing["fingerprint"] == key
+        _note(run, stage.name, "done" if current else "stale", standing["figures"], key, None)
+
+
+def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
+    module = importlib.import_module(f"pipeline.stages.{stage.name}")
+    with publishing(target) as folder:
+        job = Job(run.study, run.settings, run.products, folder, run.watcher.progress)
+        figures: dict[str, Any] = module.run(job)
+        seal(folder, key, figures)
+    return figures
+
+
+def _fingerprint(run: _Run, stage: Stage) -> str:
+    settings = run.settings.model_dump(mode="json", by_alias=True)
+    before = {name: sealed(run.products / name) for name in stage.after}
+    return fingerprint(
+        {
+            "stage": stage.name,
+            "patient_id": run.study.patient_id,
+            "inputs": {kind: run.inputs[kind] for kind in stage.inputs},
+            "study": _described(run.study, stage),
+            "settings": {name: settings[name] for name in stage.settings},
+            "before": {name: one and one["files"] for name, one in before.items()},
+            "code": code_digest(f"pipeline.stages.{stage.name}"),
+            "libraries": library_versions(),
+        }
+    )
+
+
+def _described(study: Study, stage: Stage) -> dict[str, Any]:
+    """What ``study.yaml`` says beyond file names, for the stages that read it."""
+    says: dict[str, Any] = {}
+    if "cine" in stage.inputs:
+        says["rr_ms"] = study.cine.rr_ms
+    if "us" in stage.inputs and study.us:
+        says["initial_mr_from_tracker"] = study.us.initial_mr_from_tracker
+    return says
+
+
+def _input_digests(study: Study) -> dict[str, dict[str, str]]:
+    return {
+        kind: {
+            path.relative_to(study.folder).as_posix()
+            if path.is_relative_to(study.folder)
+            else path.as_posix(): sha256_of(path)
+            for path in paths
+        }
+        for kind, paths in study.input_files().items()
+    }
+
+
+def _previous(products: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads((products / "run.json").read_text())
+        return content["stages"] if isinstance(content["stages"], dict) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _note(
+    run: _Run,
+    name: str,
+    status: str,
+    figures: Mapping[str, Any],
+    key: str,
+    measured: Mapping[str, Any] | None,
+) -> None:
+    """Record a finished stage; one that was not run again keeps the timing of when it was."""
+    if measured is None:
+        earlier = run.before.get(name, {})
+        same = earlier.get("fingerprint") == key
+        measured = {k: earlier.get(k) if same else None for k in ("seconds", "peak_memory_mb")}
+    run.stages[name] = {"status": status, "fingerprint": key, **measured, "figures": dict(figures)}
+
+
+def _record(run: _Run, status: str) -> dict[str, Any]:
+    from pipeline import __version__
+
+    content = {
+        "patient_id": run.study.patient_id,
+        "status": status,
+        "versions": {
+            "beatfield": __version__,
+            "python": platform.python_version(),
+            **library_versions(),
+        },
+        "settings": run.settings.model_dump(mode="json", by_alias=True),
+        "inputs": run.inputs,
+        "stages": run.stages,
+    }
+    write_json(run.products / "run.json", content)
+    return content

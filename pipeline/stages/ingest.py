@@ -1,0 +1,49 @@
+"""Ingest: the scanner's files become one stack of slices through the heartbeat."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.errors import InputError
+from pipeline.imaging.cine import Stack
+from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.imaging.ecg import read_ecg
+from pipeline.imaging.nifti import read_nifti_cine
+from pipeline.job import Job
+from pipeline.products import write_cine
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Read the cine, DICOM or NIfTI, and write ``cine.nii.gz`` and ``phases.json``."""
+    files = job.study.cine
+    if files.path.is_dir():
+        stack = read_dicom_cine(files.path, files.rr_ms)
+    else:
+        stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
+    _require_ecg_as_long(job, stack)
+    write_cine(job.folder, stack)
+    cine = stack.cine
+    return {
+        "phases": len(cine.phases),
+        "slices": cine.intensity.shape[1],
+        "matrix": list(cine.intensity.shape[2:]),
+        "spacing_mm": [round(float(value), 4) for value in cine.spacing_mm],
+        "rr_s": round(cine.rr_s, 4),
+        "timing_source": stack.timing_source,
+        "left_out": len(stack.left_out),
+    }
+
+
+def _require_ecg_as_long(job: Job, stack: Stack) -> None:
+    """Refuse an ECG that cannot be of this cine: every slice takes a heartbeat at the least."""
+    if job.study.ecg.mr is None:
+        return
+    ecg = read_ecg(job.study.ecg.mr)
+    lasts_s = len(ecg.signal_mv) / ecg.sampling_rate_hz
+    needed_s = float(stack.rr_ms.sum()) / 1000
+    if lasts_s < needed_s:
+        raise InputError(
+            f"{job.study.ecg.mr}: the ECG is shorter than the cine: it lasts {lasts_s:.1f} s, and "
+            f"{len(stack.rr_ms)} slices of a heartbeat each take {needed_s:.1f} s at the least; "
+            "give the whole record, or take it out of the study"
+        )

@@ -1,0 +1,32 @@
+"""Segment: chambers and heart muscle in every phase, from the images alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.imaging.labels import LABELS
+from pipeline.imaging.segmentation import segment_cine
+from pipeline.job import Job
+from pipeline.products import read_cine, write_labels, write_table
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Write labels on the cine's own slices and the same heart on an isotropic grid."""
+    cine = read_cine(job.products / "ingest")
+    found = segment_cine(cine, job.settings.segment, job.progress)
+    write_labels(job.folder, "labels", found.labels, cine.mr_from_index)
+    write_labels(job.folder, "heart", found.heart, found.heart_mr_from_index)
+    write_table(job.folder / "labels.json", LABELS)
+    write_table(
+        job.folder / "confidence.json",
+        {"confidence": np.round(found.confidence, 4).tolist(), "axes": ["phase", "slice"]},
+    )
+    voxel_ml = float(np.abs(np.linalg.det(found.heart_mr_from_index[:3, :3]))) / 1000
+    volumes = {
+        name: [round(float((volume == value).sum()) * voxel_ml, 1) for volume in found.heart]
+        for name, value in LABELS.items()
+    }
+    confidence = found.confidence[np.isfinite(found.confidence)]
+    return {"lowest_confidence": round(float(confidence.min()), 3), "volumes_ml": volumes}

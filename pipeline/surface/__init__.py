@@ -1,0 +1,1 @@
+"""From labels to closed surfaces whose vertices correspond through the beat."""

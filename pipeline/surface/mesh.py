@@ -1,0 +1,160 @@
+"""Triangle meshes of level sets: closed, outward, even; and the operators defined on them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+from skimage.measure import marching_cubes
+
+from pipeline.errors import StageError
+from pipeline.geometry import Float, Integer, Mask, Surface
+from pipeline.surface.level_set import LevelSet
+
+# Marching cubes with step h leaves 3/2 vertices per h^2 of surface (the mean of |nx|+|ny|+|nz|
+# over all directions); equilateral triangles with that density have edges of 0.877 h.
+EDGE_PER_STEP = (2 / np.sqrt(3) / 1.5) ** 0.5
+RELAXATIONS = 30
+UNTANGLINGS = 20
+SLIVER_QUALITY = 0.3
+
+
+def extract_surface(level: LevelSet, edge_mm: float) -> Surface:
+    """Closed surface of even triangles on the zero level of a signed distance.
+
+    Marching cubes (Lewiner et al. 2003) on a grid whose step suits the edge, largest component
+    only, then tangential relaxation with the vertices kept on the zero level: unlike plain
+    smoothing it neither shrinks the body nor rounds it.
+
+    Raises
+    ------
+    StageError
+        When the level set has no zero level, or its surface is not closed.
+    """
+    surface = largest_component(_march(level, edge_mm / EDGE_PER_STEP))
+    if surface.volume_mm3() < 0:
+        surface = flipped(surface)
+    if len(surface.boundary_edges()):
+        raise StageError(
+            f"marching cubes left {len(surface.boundary_edges())} open edges on a surface of "
+            f"{len(surface.triangles)} triangles; a structure must not reach the grid's border"
+        )
+    return _relaxed(surface, level)
+
+
+def _march(level: LevelSet, step_mm: float) -> Surface:
+    """Marching cubes on a grid of its own step, vertices in the level set's millimetres."""
+    extent_mm = (np.array(level.distance_mm.shape) - 1) * level.spacing_mm
+    counts = np.maximum(np.ceil(extent_mm / step_mm).astype(int) + 1, 2)
+    index = np.indices(tuple(counts)) * (step_mm / level.spacing_mm)
+    field = ndimage.map_coordinates(level.distance_mm, index, order=1, mode="nearest")
+    # A node exactly on the level would give several vertices in one place.
+    field = np.where(np.abs(field) < 1e-3 * step_mm, 1e-3 * step_mm, field)
+    if not (field.min() < 0 < field.max()):
+        raise StageError("a structure is too small for a surface: its smooth distance has no zero")
+    vertices, triangles, _, _ = marching_cubes(field, 0.0, spacing=(step_mm,) * 3)
+    return Surface(vertices[:, ::-1].astype(np.float64), triangles.astype(np.int64))
+
+
+def flipped(surface: Surface) -> Surface:
+    """The same surface with its normals turned round."""
+    return Surface(surface.vertices_mm, np.ascontiguousarray(surface.triangles[:, ::-1]))
+
+
+def largest_component(surface: Surface) -> Surface:
+    """The connected part with most vertices, renumbered."""
+    _, part = csgraph.connected_components(adjacency(surface.triangles, len(surface.vertices_mm)))
+    chosen = part == np.bincount(part).argmax()
+    number = np.cumsum(chosen) - 1
+    triangles = number[surface.triangles[chosen[surface.triangles[:, 0]]]]
+    return Surface(surface.vertices_mm[chosen], triangles)
+
+
+def adjacency(triangles: Integer, count: int) -> sparse.csr_array:
+    """Symmetric ``(n, n)`` matrix with a one for each pair of vertices that share an edge."""
+    rows = triangles[:, [0, 1, 2]].ravel()
+    columns = triangles[:, [1, 2, 0]].ravel()
+    both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+    matrix = sparse.csr_array((np.ones(len(both[0])), both), shape=(count, count))
+    matrix.data[:] = 1.0
+    return matrix
+
+
+def laplacian(triangles: Integer, count: int) -> sparse.csr_array:
+    """Graph Laplacian over its mean degree of six: about ``edge^2 / 4`` times minus Laplace's."""
+    neighbours = adjacency(triangles, count)
+    degree = sparse.diags_array(neighbours.sum(axis=1))
+    return sparse.csr_array((degree - neighbours) / 6.0)
+
+
+def vertex_normals(vertices_mm: Float, triangles: Integer) -> Float:
+    """Unit normals ``(n, 3)``: the area-weighted mean over the triangles of a vertex."""
+    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
+    face = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices_mm)
+    for k in range(3):
+        for axis in range(3):
+            normals[:, axis] += np.bincount(triangles[:, k], face[:, axis], len(vertices_mm))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.maximum(length, np.finfo(float).tiny))
+
+
+def vertex_areas(vertices_mm: Float, triangles: Integer) -> Float:
+    """Third of the area ``(n,)`` of the triangles round each vertex, mm^2."""
+    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    shares = [np.bincount(triangles[:, k], area, len(vertices_mm)) for k in range(3)]
+    return np.asarray(np.sum(shares, axis=0))
+
+
+def triangle_quality(vertices_mm: Float, triangles: Integer) -> Float:
+    """4 sqrt(3) area over the sum of squared edges ``(m,)``: 1 if equilateral, 0 if a line."""
+    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    squares = sum(np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c))
+    return np.asarray(4 * np.sqrt(3) * area / np.maximum(squares, np.finfo(float).tiny))
+
+
+def untangled(vertices_mm: Float, triangles: Integer, level: LevelSet) -> Float:
+    """Vertices ``(n, 3)`` whose triangles are neither slivers nor folded over, as far as it goes.
+
+    Only vertices of bad triangles and their neighbours move: towards the mean of their own
+    neighbours, and back onto the zero level. Where the level itself is too sharp for the mesh that
+    folds them again, so the later rounds let the surface be round instead.
+    """
+    neighbours = adjacency(triangles, len(vertices_mm))
+    degree = neighbours.sum(axis=1)[:, None]
+    for done in range(UNTANGLINGS):
+        bad = bad_triangles(vertices_mm, triangles)
+        if not bad.any():
+            break
+        touched = np.zeros(len(vertices_mm), dtype=bool)
+        touched[triangles[bad]] = True
+        touched |= neighbours @ touched.astype(float) > 0
+        pull = np.where(touched[:, None], neighbours @ vertices_mm / degree - vertices_mm, 0)
+        vertices_mm = vertices_mm + 0.5 * pull
+        if done < UNTANGLINGS / 2:
+            step = level.newton_step(vertices_mm, level.spacing_mm)
+            vertices_mm = vertices_mm + np.where(touched[:, None], step, 0)
+    return vertices_mm
+
+
+def bad_triangles(vertices_mm: Float, triangles: Integer) -> Mask:
+    """Which triangles ``(m,)`` are slivers or look away from the surface round them."""
+    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
+    around = vertex_normals(vertices_mm, triangles)[triangles].sum(axis=1)
+    folded = np.einsum("ij,ij->i", np.cross(b - a, c - a), around) <= 0
+    return np.asarray(folded | (triangle_quality(vertices_mm, triangles) < SLIVER_QUALITY))
+
+
+def _relaxed(surface: Surface, level: LevelSet) -> Surface:
+    """Slide vertices towards the mean of their neighbours, back on the zero level each time."""
+    vertices, triangles = surface.vertices_mm, surface.triangles
+    neighbours = adjacency(triangles, len(vertices))
+    degree = neighbours.sum(axis=1)[:, None]
+    for _ in range(RELAXATIONS):
+        pull = 0.5 * (neighbours @ vertices / degree - vertices)
+        normals = vertex_normals(vertices, triangles)
+        vertices = vertices + pull - np.einsum("ij,ij->i", pull, normals)[:, None] * normals
+        vertices = vertices + level.newton_step(vertices, level.spacing_mm)
+    return Surface(vertices, triangles)

@@ -1,0 +1,83 @@
+"""A folder of patients: one that fails or crashes costs only itself."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline import batch
+from pipeline.cli import main
+
+# Stands in for the pipeline's own process: the patient's name says how its run ends.
+PROGRAM = """
+import json, os, pathlib, signal, sys
+study, out = pathlib.Path(sys.argv[4]), pathlib.Path(sys.argv[6])
+if study.name == "fails":
+    print("error: cine: missing slice", file=sys.stderr); sys.exit(2)
+if study.name == "crashes":
+    os.kill(os.getpid(), signal.SIGSEGV)
+if study.name == "raises":
+    raise RuntimeError("a bug")
+figures = {"surface": {"figures": {"lv_ejection_fraction": 0.61}},
+           "evaluate": {"figures": {"target_registration_error_mm": 1.25}}}
+(out / study.name).mkdir()
+(out / study.name / "run.json").write_text(json.dumps({"stages": figures}))
+"""
+
+
+@pytest.fixture
+def studies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("crashes", "fails", "good", "raises", "well"):
+        (tmp_path / "studies" / name / "cine").mkdir(parents=True)
+        (tmp_path / "studies" / name / "cine" / "image").touch()
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    wrapper = tmp_path / "python"
+    wrapper.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{program}" "$@"\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setattr(batch.sys, "executable", str(wrapper))
+    return tmp_path / "studies"
+
+
+def test_each_patient_ends_alone_and_the_table_says_how(
+    studies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["batch", str(studies), "--out", str(out), "--workers", "2"]) == 1
+    with (out / "batch.csv").open(newline="") as handle:
+        rows = {row["patient"]: row for row in csv.DictReader(handle)}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "crashes": "crashed",
+        "fails": "failed",
+        "good": "done",
+        "raises": "crashed",
+        "well": "done",
+    }
+    assert rows["fails"]["cause"] == "cine: missing slice"
+    assert signal.Signals.SIGSEGV.name in rows["crashes"]["cause"]
+    assert "RuntimeError: a bug" in rows["raises"]["cause"]
+    assert rows["good"]["lv_ejection_fraction"] == "0.61"
+    assert rows["well"]["target_registration_error_mm"] == "1.25"
+    printed = capsys.readouterr().out
+    for name, row in rows.items():
+        assert name in printed
+        assert row["cause"] in printed
+
+
+def test_all_done_is_exit_code_0(studies: Path, tmp_path: Path) -> None:
+    for name in ("crashes", "fails", "raises"):
+        os.renames(studies / name, tmp_path / "elsewhere" / name)
+    assert main(["batch", str(studies), "--out", str(tmp_path / "out"), "--workers", "3"]) == 0
+
+
+def test_two_studies_of_one_patient_are_refused(
+    studies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (studies / "well" / "study.yaml").write_text("patient_id: good\n")
+    assert main(["batch", str(studies), "--out", str(tmp_path / "out")]) == 2
+    assert "has the patient id 'good'" in capsys.readouterr().err

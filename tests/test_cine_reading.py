@@ -1,0 +1,341 @@
+"""Cine MR read from files that pydicom and nibabel wrote, good ones and bad ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage, generate_uid
+
+from pipeline.errors import InputError
+from pipeline.geometry import transform_points
+from pipeline.imaging.cine import Stack
+from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.imaging.nifti import read_image, read_nifti_cine, write_image
+
+Change = Callable[[FileDataset, int, int], bool]
+
+SLICES, PHASES, ROWS, COLUMNS = 4, 5, 6, 8
+RR_MS = 800.0
+STEP_MM = 10.0
+
+# A stack that is oblique to every axis of the patient.
+ROW_AXIS = np.array([0.8, 0.6, 0.0])
+COLUMN_AXIS = np.array([0.0, 0.0, -1.0])
+NORMAL = np.cross(ROW_AXIS, COLUMN_AXIS)
+ORIGIN_MM = np.array([-50.0, 30.0, 12.5])
+PIXEL_MM = (1.5, 1.25)  # from row to row, from column to column
+
+
+def pixel_value(phase: int, number: int) -> Any:
+    """An image that no other slice and phase has."""
+    return (100 * number + 10 * phase + np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)).astype(
+        np.uint16
+    )
+
+
+def dicom_frame(number: int, phase: int) -> FileDataset:
+    """One classic single-frame MR image."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = MRImageStorage
+    meta.MediaStorageSOPInstanceUID = generate_uid()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
+    data.SOPClassUID, data.SOPInstanceUID = MRImageStorage, meta.MediaStorageSOPInstanceUID
+    data.Modality = "MR"
+    data.Rows, data.Columns = ROWS, COLUMNS
+    data.ImagePositionPatient = (ORIGIN_MM + number * STEP_MM * NORMAL).tolist()
+    data.ImageOrientationPatient = [*ROW_AXIS, *COLUMN_AXIS]
+    data.PixelSpacing = list(PIXEL_MM)
+    data.TriggerTime = phase * RR_MS / PHASES
+    data.NominalInterval = int(RR_MS)
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    data.PixelData = pixel_value(phase, number).tobytes()
+    return data
+
+
+def write_dicom(
+    folder: Path, change: Callable[[FileDataset, int, int], bool] | None = None
+) -> None:
+    """A stack in files whose names say nothing of their order; ``change`` may drop one."""
+    rng = np.random.default_rng(4)
+    names = rng.permutation(SLICES * PHASES)
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in range(SLICES):
+        for phase in range(PHASES):
+            data = dicom_frame(number, phase)
+            if change is not None and not change(data, number, phase):
+                continue
+            data.save_as(folder / f"{names[number * PHASES + phase]:04d}.dcm")
+
+
+def assert_is_the_stack(stack: Stack) -> None:
+    cine = stack.cine
+    assert cine.intensity.shape == (PHASES, SLICES, ROWS, COLUMNS)
+    for phase in range(PHASES):
+        for number in range(SLICES):
+            np.testing.assert_array_equal(cine.intensity[phase, number], pixel_value(phase, number))
+    np.testing.assert_allclose(cine.phases, np.arange(PHASES) / PHASES)
+    assert cine.rr_s == pytest.approx(RR_MS / 1000)
+    # The third pixel of row 2 in slice 3, by the DICOM standard's own equation (C.7.6.2.1).
+    expected_mm = ORIGIN_MM + 3 * STEP_MM * NORMAL
+    expected_mm = expected_mm + 3 * PIXEL_MM[1] * ROW_AXIS + 2 * PIXEL_MM[0] * COLUMN_AXIS
+    found_mm = transform_points(cine.mr_from_index, np.array([3.0, 2.0, 3.0]))
+    np.testing.assert_allclose(found_mm, expected_mm, atol=1e-6)
+
+
+def test_classic_dicom_is_sorted_by_position_then_trigger_time(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "cine")
+    assert_is_the_stack(read_dicom_cine(tmp_path / "cine"))
+
+
+def test_enhanced_dicom_gives_the_same_stack(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    order = [divmod(int(k), PHASES) for k in rng.permutation(SLICES * PHASES)]
+    data = dicom_frame(0, 0)
+    for name in ("TriggerTime", "NominalInterval", "ImagePositionPatient"):
+        delattr(data, name)
+    shared = Dataset()
+    shared.PlaneOrientationSequence = [Dataset()]
+    shared.PlaneOrientationSequence[0].ImageOrientationPatient = data.ImageOrientationPatient
+    shared.PixelMeasuresSequence = [Dataset()]
+    shared.PixelMeasuresSequence[0].PixelSpacing = data.PixelSpacing
+    del data.ImageOrientationPatient, data.PixelSpacing
+    data.SharedFunctionalGroupsSequence = [shared]
+    groups = []
+    for number, phase in order:
+        own = Dataset()
+        own.PlanePositionSequence = [Dataset()]
+        position_mm = ORIGIN_MM + number * STEP_MM * NORMAL
+        own.PlanePositionSequence[0].ImagePositionPatient = position_mm.tolist()
+        own.CardiacSynchronizationSequence = [Dataset()]
+        timing = own.CardiacSynchronizationSequence[0]
+        timing.NominalCardiacTriggerDelayTime = phase * RR_MS / PHASES
+        timing.RRIntervalTimeNominal = RR_MS
+        groups.append(own)
+    data.PerFrameFunctionalGroupsSequence = groups
+    data.NumberOfFrames = len(order)
+    data.PixelData = b"".join(pixel_value(phase, number).tobytes() for number, phase in order)
+    (tmp_path / "cine").mkdir()
+    data.save_as(tmp_path / "cine" / "all.dcm")
+
+    assert_is_the_stack(read_dicom_cine(tmp_path / "cine"))
+
+
+def test_slices_of_another_orientation_are_left_out_and_named(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "cine")
+    for phase in range(PHASES):
+        data = dicom_frame(0, phase)
+        data.ImageOrientationPatient = [0, 1, 0, 0, 0, -1]
+        data.save_as(tmp_path / "cine" / f"long_axis_{phase}.dcm")
+    stack = read_dicom_cine(tmp_path / "cine")
+    assert_is_the_stack(stack)
+    assert len(stack.left_out) == PHASES
+    assert "long_axis_0.dcm" in stack.left_out[0]
+
+
+def drop(name: str) -> Change:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        delattr(data, name)
+        return True
+
+    return change
+
+
+def alter(name: str, value: Any, at: int = 2) -> Change:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        if number == at:
+            setattr(data, name, value)
+            if name == "Rows":
+                data.PixelData = data.PixelData[: value * COLUMNS * 2]
+        return True
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data, number, phase: number != 1, "missing slice"),
+        (lambda data, number, phase: (number, phase) != (1, 2), "missing phase: slice 1"),
+        (alter("Rows", 4), "different matrices"),
+        (alter("PixelSpacing", [2.0, 2.0]), "different pixel spacing"),
+        (alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()), "different spacing"),
+        (drop("TriggerTime"), "no trigger time"),
+        (drop("NominalInterval"), "no RR interval"),
+        (drop("ImagePositionPatient"), "no ImagePositionPatient"),
+        (alter("NominalInterval", 90000), "RR interval 90000 ms"),
+        (alter("TriggerTime", 0.0), "same trigger time"),
+        (lambda data, number, phase: number == 0, "1 slices of 5 phases"),
+        (lambda data, number, phase: phase == 0, "4 slices of 1 phases"),
+    ],
+)
+def test_a_bad_dicom_stack_is_refused_with_its_reason(
+    tmp_path: Path, change: Change, words: str
+) -> None:
+    write_dicom(tmp_path / "cine", change)
+    with pytest.raises(InputError, match=words) as raised:
+        read_dicom_cine(tmp_path / "cine")
+    assert "cine" in str(raised.value)
+
+
+@pytest.mark.parametrize("kept", [0, 60, 400, -20])
+def test_a_truncated_dicom_file_is_named(tmp_path: Path, kept: int) -> None:
+    write_dicom(tmp_path)
+    victim = tmp_path / "0007.dcm"
+    victim.write_bytes(victim.read_bytes()[:kept])
+    with pytest.raises(InputError, match=r"0007\.dcm"):
+        read_dicom_cine(tmp_path)
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is empty"):
+        read_dicom_cine(tmp_path)
+
+
+def test_the_users_rr_interval_overrides_the_files(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    stack = read_dicom_cine(tmp_path, rr_ms=1000)
+    np.testing.assert_allclose(stack.cine.phases, 0.8 * np.arange(PHASES) / PHASES)
+    assert stack.timing_source == "study.yaml"
+
+
+def test_rescaled_pixels_are_in_the_scanners_units(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.RescaleSlope, data.RescaleIntercept = 2, -7
+        return True
+
+    write_dicom(tmp_path, change)
+    found = read_dicom_cine(tmp_path).cine.intensity[1, 2]
+    np.testing.assert_array_equal(found, 2.0 * pixel_value(1, 2) - 7)
+
+
+def nifti_cine(path: Path, affine_ras: Any, step_s: float | None = 0.16) -> None:
+    """A 4D file by nibabel alone."""
+    data = np.arange(8 * 6 * 4 * 5, dtype=np.int16).reshape(8, 6, 4, 5)
+    image = nibabel.Nifti1Image(data, affine_ras)
+    if step_s is not None:
+        image.header.set_xyzt_units("mm", "sec")
+        image.header.set_zooms((*image.header.get_zooms()[:3], step_s))
+    nibabel.save(image, path)
+
+
+def test_nifti_is_turned_from_ras_to_lps_and_phase_first(tmp_path: Path) -> None:
+    affine = np.array([[1.5, 0, 0, -20], [0, 0, -10, 5], [0, 1.25, 0, 7], [0, 0, 0, 1.0]])
+    nifti_cine(tmp_path / "cine.nii.gz", affine)
+    cine = read_nifti_cine(tmp_path / "cine.nii.gz", None).cine
+    data = nibabel.load(tmp_path / "cine.nii.gz").get_fdata()
+    assert cine.intensity[3, 2, 1, 5] == data[5, 1, 2, 3]
+    ras_mm = affine @ (5, 1, 2, 1)
+    lps_mm = transform_points(cine.mr_from_index, np.array([5.0, 1.0, 2.0]))
+    np.testing.assert_allclose(lps_mm, (-ras_mm[0], -ras_mm[1], ras_mm[2]), atol=1e-5)
+    np.testing.assert_allclose(cine.phases, np.arange(5) / 5)
+    assert cine.rr_s == pytest.approx(0.8, rel=1e-6)
+
+
+def test_a_timing_file_gives_each_slice_its_own_heartbeat(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=None)
+    rr_ms = [800.0, 900.0, 1000.0, 700.0]
+    triggers = [[rr * k / 5 for k in range(5)] for rr in rr_ms]
+    timing = tmp_path / "timing.json"
+    timing.write_text(json.dumps({"trigger_times_ms": triggers, "rr_ms": rr_ms}))
+    stack = read_nifti_cine(tmp_path / "cine.nii", timing)
+    np.testing.assert_allclose(stack.cine.phases, np.arange(5) / 5)
+    assert stack.cine.rr_s == pytest.approx(0.85)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{}", "trigger_times_ms"),
+        ("not json", r"timing\.json"),
+        ('{"trigger_times_ms": [0, 1], "rr_ms": 800}', "4 lists of 5 numbers"),
+        ('{"trigger_times_ms": [0, 200, 100, 300, 400], "rr_ms": 800}', "must rise"),
+        ('{"trigger_times_ms": [0, 200, 400, 600, 900], "rr_ms": 800}', "do not fit"),
+    ],
+)
+def test_a_bad_timing_file_is_refused(tmp_path: Path, content: str, words: str) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]))
+    timing = tmp_path / "timing.json"
+    timing.write_text(content)
+    with pytest.raises(InputError, match=words):
+        read_nifti_cine(tmp_path / "cine.nii", timing)
+
+
+def test_a_slice_with_phases_of_its_own_is_refused(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]))
+    even = [160.0 * k for k in range(5)]
+    late = [150.0 + 130.0 * k for k in range(5)]
+    timing = tmp_path / "timing.json"
+    timing.write_text(json.dumps({"trigger_times_ms": [even, even, late, even], "rr_ms": 800}))
+    with pytest.raises(InputError, match="slice 2 lies"):
+        read_nifti_cine(tmp_path / "cine.nii", timing)
+
+
+def test_a_sheared_affine_is_refused(tmp_path: Path) -> None:
+    affine = np.diag([1.5, 1.5, 10, 1.0])
+    affine[0, 1] = 0.2
+    nifti_cine(tmp_path / "cine.nii", affine)
+    with pytest.raises(InputError, match="sheared"):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+
+
+def test_nifti_without_timing_is_refused(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=None)
+    with pytest.raises(InputError, match="no trigger times"):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+
+
+def test_a_truncated_nifti_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cine.nii.gz"
+    nifti_cine(path, np.diag([1, 1, 8, 1.0]))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(InputError, match=r"cine\.nii\.gz"):
+        read_nifti_cine(path, None)
+
+
+@given(
+    angles=st.tuples(*[st.floats(-3, 3)] * 3),
+    spacing_mm=st.tuples(*[st.floats(0.3, 12)] * 3),
+    flip=st.booleans(),
+    shape=st.tuples(*[st.integers(1, 5)] * 4),
+)
+def test_nifti_written_then_read_is_the_same_image_in_the_same_place(
+    tmp_path_factory: pytest.TempPathFactory,
+    angles: tuple[float, float, float],
+    spacing_mm: tuple[float, float, float],
+    flip: bool,
+    shape: tuple[int, int, int, int],
+) -> None:
+    from scipy.spatial.transform import Rotation
+
+    path = tmp_path_factory.mktemp("nifti") / "image.nii.gz"
+    mr_from_index = np.eye(4)
+    mr_from_index[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix() * spacing_mm
+    mr_from_index[:3, 3] = (-31.0, 12.0, 250.0)
+    if flip:
+        mr_from_index[:3, 2] *= -1
+    array = np.arange(np.prod(shape), dtype=np.int16).reshape(shape)
+    write_image(path, array, mr_from_index)
+    first = path.read_bytes()
+    found, place = read_image(path)
+    np.testing.assert_array_equal(found.reshape(shape), array)
+    # The header holds single precision: seven digits of at most 250 mm.
+    np.testing.assert_allclose(place, mr_from_index, atol=250 * 2**-23)
+    write_image(path, array, mr_from_index)
+    assert path.read_bytes() == first
+
+
+def test_pydicom_itself_reads_what_the_tests_write(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    assert pydicom.dcmread(tmp_path / "0000.dcm").pixel_array.shape == (ROWS, COLUMNS)

@@ -1,0 +1,126 @@
+"""The command line: exit codes, messages, and how soon it answers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.cli import main
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "no-such-study", "--out", "o"], "no-such-study: no such study"),
+        (["run", ".", "--out", "o", "--config", "none.yaml"], "none.yaml: cannot be read"),
+        (["run", "p", "--out", "o", "--until", "polish"], "no stage 'polish'; the stages are"),
+        (["run", "p", "--out", "o", "--from", "polish"], "no stage 'polish'; the stages are"),
+        (["bake", "--out", "o"], "needs either a STUDY or --surfaces"),
+        (["query", "none.zarr", "--point", "0", "0", "0", "--phase", "0"], "none.zarr"),
+        (["verify", "none.zarr"], "none.zarr"),
+        (["batch", "none", "--out", "o"], "none: no such folder"),
+        (["batch", ".", "--out", "o", "--workers", "0"], "at least 1 is needed"),
+        (["batch", ".", "--out", "o"], "holds no study"),
+    ],
+)
+def test_wrong_input_ends_with_exit_code_2_and_says_what_is_wrong(
+    arguments: list[str],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "error: " in said
+    assert words in said
+    assert not list(tmp_path.iterdir()), "nothing is written for a command that is wrong"
+
+
+@pytest.mark.parametrize(
+    "arguments", [["rnu", "p"], ["run", "p"], ["run", "p", "--out", "o", "--untill", "bake"]]
+)
+def test_a_wrong_command_ends_with_exit_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("yaml", "words"),
+    [
+        ("bkae: {spacing_mm: 1}", "bkae: unknown key"),
+        ("bake: {spcing_mm: 1}", "bake.spcing_mm: unknown key"),
+        ("bake: {spacing_mm: wide}", "bake.spacing_mm"),
+        ("bake: [1, 2]", "bake"),
+        ("fixtures: {}", "at least one fixture"),
+        (
+            "fixtures: {f: {structure: s, kind: guidance, delta_mm: 3, gamma_mm: 1, f_max_n: 1}}",
+            "exactly one of delta_mm and gamma_mm",
+        ),
+        (
+            "fixtures: {f: {structure: s, kind: guidance, delta_mm: 9, f_max_n: 5}}",
+            "beyond the touch",
+        ),
+        (
+            "fixtures: {f: {structure: s, kind: guidance, delta_mm: 1, f_max_n: 3}}",
+            "smallest width that would do",
+        ),
+        ("a: [", "cannot be read as YAML"),
+        ("7", "needs sections"),
+    ],
+)
+def test_a_wrong_config_is_refused_with_file_and_key(
+    yaml: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "mine.yaml"
+    config.write_text(yaml)
+    arguments = ["run", str(tmp_path), "--out", str(tmp_path / "o"), "--config", str(config)]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "mine.yaml" in said
+    assert words in said
+
+
+def test_the_default_configuration_file_says_what_the_code_says() -> None:
+    from pipeline.config import Settings, read_settings
+
+    described = Path(__file__).parent.parent / "configs" / "default.yaml"
+    assert read_settings(described) == Settings()
+    # Every setting is in the file, so that a user sees all that can be set.
+    import yaml
+
+    def keys(tree: object) -> set[str]:
+        if not isinstance(tree, dict):
+            return set()
+        return set(tree) | {k for value in tree.values() for k in keys(value)}
+
+    shown = keys(yaml.safe_load(described.read_text()))
+    sections = Settings().model_dump(by_alias=True)
+    for section in ("segment", "surface", "register", "bake"):
+        assert set(sections[section]) <= shown
+
+
+@pytest.mark.parametrize("path", sorted(Path("configs/fixtures").glob("*.yaml")))
+def test_every_named_fixture_can_be_used(path: Path) -> None:
+    from pipeline.config import read_settings
+
+    assert read_settings(path).fixtures
+
+
+def test_help_loads_no_heavy_library() -> None:
+    script = (
+        "import sys; from pipeline.cli import main; main(['--help'])\n"
+        "heavy = {'numpy', 'SimpleITK', 'vtk', 'pyvista', 'scipy', 'numba', 'cv2', 'matplotlib'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    for command in ("run", "batch", "bake", "query", "verify", "synth", "segment"):
+        assert command in done.stdout

@@ -1,0 +1,256 @@
+"""ECG files of three kinds, written by independent libraries, are read or refused with a reason."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+
+import numpy as np
+import pydicom
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.sequence import Sequence
+from pydicom.uid import ExplicitVRLittleEndian
+
+from pipeline.errors import InputError
+from pipeline.imaging.ecg import read_ecg
+
+RATE_HZ = 250.0
+# Every value is a whole number of the 1 microvolt steps of the files below.
+STEPS_UV = np.random.default_rng(0).integers(-2000, 2000, size=(1000, 2))
+
+
+def write_wfdb(folder, units="mV", signal=None, name="rec", gain=1000.0):
+    signal = STEPS_UV / 1000.0 if signal is None else signal
+    channels = signal.shape[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        importlib.import_module("wfdb").wrsamp(
+            name,
+            fs=RATE_HZ,
+            units=[units] * channels,
+            sig_name=["I", "II"][:channels],
+            p_signal=signal,
+            fmt=["16"] * channels,
+            adc_gain=[gain] * channels,
+            baseline=[0] * channels,
+            write_dir=str(folder),
+        )
+    return folder / name
+
+
+def write_csv(path, signal=None, times_s=None, header="time_s,I,II"):
+    signal = STEPS_UV / 1000.0 if signal is None else signal
+    times_s = np.arange(len(signal)) / RATE_HZ if times_s is None else times_s
+    rows = [
+        ",".join([f"{t:.6f}", *(f"{v:.3f}" for v in row)])
+        for t, row in zip(times_s, signal, strict=True)
+    ]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def coded(value, meaning):
+    item = Dataset()
+    item.CodeValue, item.CodingSchemeDesignator, item.CodeMeaning = value, "UCUM", meaning
+    return Sequence([item])
+
+
+def channel(name, unit):
+    item = Dataset()
+    item.ChannelSourceSequence = coded("2:1", f"Lead {name}")
+    item.ChannelSensitivity = "1"
+    item.ChannelSensitivityUnitsSequence = coded(unit, "voltage")
+    item.ChannelSensitivityCorrectionFactor = "1"
+    item.ChannelBaseline = "0"
+    item.WaveformBitsStored = 16
+    return item
+
+
+def waveform_group(steps, unit):
+    group = Dataset()
+    group.WaveformOriginality = "ORIGINAL"
+    group.NumberOfWaveformChannels = steps.shape[1]
+    group.NumberOfWaveformSamples = len(steps)
+    group.SamplingFrequency = str(RATE_HZ)
+    group.WaveformBitsAllocated = 16
+    group.WaveformSampleInterpretation = "SS"
+    names = ("I", "II")[: steps.shape[1]]
+    group.ChannelDefinitionSequence = Sequence([channel(n, unit) for n in names])
+    group.WaveformData = steps.astype("<i2").tobytes()
+    return group
+
+
+def write_dicom(path, groups=None, unit="uV"):
+    dataset = Dataset()
+    dataset.file_meta = FileMetaDataset()
+    dataset.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset.SOPClassUID = pydicom.uid.TwelveLeadECGWaveformStorage
+    dataset.SOPInstanceUID = "1.2.3"
+    if groups != []:
+        dataset.WaveformSequence = Sequence(groups or [waveform_group(STEPS_UV, unit)])
+    dataset.save_as(path, enforce_file_format=True)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["", ".hea", ".dat"])
+def test_wfdb_record_is_named_by_stem_or_by_either_file(tmp_path, suffix):
+    stem = write_wfdb(tmp_path)
+    ecg = read_ecg(stem.with_name(stem.name + suffix))
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0, rtol=0, atol=1e-9)
+    assert (ecg.leads, ecg.sampling_rate_hz, ecg.start_s) == (("I", "II"), RATE_HZ, 0.0)
+
+
+@pytest.mark.parametrize(("unit", "millivolts"), [("mV", 1.0), ("uV", 1e-3), ("V", 1e3)])
+def test_wfdb_units_become_millivolts(tmp_path, unit, millivolts):
+    stem = write_wfdb(tmp_path, units=unit)
+    expected = STEPS_UV / 1000.0 * millivolts
+    np.testing.assert_allclose(read_ecg(stem).signal_mv, expected, rtol=1e-9)
+
+
+def test_csv_starts_at_its_first_time(tmp_path):
+    path = write_csv(tmp_path / "ecg.csv", times_s=12.5 + np.arange(1000) / RATE_HZ)
+    ecg = read_ecg(path)
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0, rtol=0, atol=1e-9)
+    assert ecg.start_s == 12.5
+    # Times are written to the microsecond over 4 s.
+    assert ecg.sampling_rate_hz == pytest.approx(RATE_HZ, rel=1e-6 / 3.9)
+
+
+@given(rate_hz=st.floats(100.0, 800.0), start_s=st.floats(0.0, 1e4))
+def test_csv_times_rounded_to_milliseconds_are_still_even(tmp_path_factory, rate_hz, start_s):
+    folder = tmp_path_factory.mktemp("csv")
+    times_s = np.round(start_s + np.arange(300) / rate_hz, 3)
+    path = write_csv(folder / "ecg.csv", signal=STEPS_UV[:300] / 1000.0, times_s=times_s)
+    # Rounding moves each time by half a millisecond at most; the slope of a line through n points
+    # moves by at most 1.5 / (n - 1) of that on either side, when one half is early, the other late.
+    assert read_ecg(path).sampling_rate_hz == pytest.approx(rate_hz, rel=1.6e-3 * rate_hz / 299)
+
+
+def test_dicom_waveform_is_read_in_millivolts(tmp_path):
+    ecg = read_ecg(write_dicom(tmp_path / "ecg.dcm"))
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0, rtol=0, atol=1e-9)
+    assert (ecg.leads, ecg.sampling_rate_hz) == (("I", "II"), RATE_HZ)
+
+
+def test_dicom_recording_is_preferred_to_the_averaged_beat(tmp_path):
+    beat = waveform_group(STEPS_UV[:200, :1], "uV")
+    whole = waveform_group(STEPS_UV, "uV")
+    assert len(read_ecg(write_dicom(tmp_path / "ecg.dcm", [beat, whole])).signal_mv) == 1000
+
+
+@pytest.mark.parametrize("name", ["ecg", "ecg.hea", "ecg.csv", "ecg.dcm"])
+def test_missing_file_is_named(tmp_path, name):
+    with pytest.raises(InputError, match=r"ecg.*no such"):
+        read_ecg(tmp_path / name)
+
+
+def test_truncated_wfdb_signal_is_refused(tmp_path):
+    stem = write_wfdb(tmp_path)
+    data = stem.with_suffix(".dat")
+    data.write_bytes(data.read_bytes()[:-700])
+    with pytest.raises(InputError, match="WFDB"):
+        read_ecg(stem)
+
+
+def test_wfdb_header_without_signal_is_refused(tmp_path):
+    stem = write_wfdb(tmp_path)
+    stem.with_suffix(".dat").unlink()
+    with pytest.raises(InputError, match=r"rec\.hea.*\.dat"):
+        read_ecg(stem)
+
+
+@pytest.mark.parametrize("content", ["", "not a header at all", "rec two 250 1000\n"])
+def test_damaged_wfdb_header_is_refused(tmp_path, content):
+    stem = write_wfdb(tmp_path)
+    stem.with_suffix(".hea").write_text(content)
+    with pytest.raises(InputError, match=r"rec\.hea"):
+        read_ecg(stem)
+
+
+def test_truncated_dicom_waveform_is_refused(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    group.WaveformData = group.WaveformData[:-700]
+    with pytest.raises(InputError, match="cannot be decoded"):
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", [group]))
+
+
+def test_truncated_dicom_file_is_refused(tmp_path):
+    path = write_dicom(tmp_path / "ecg.dcm")
+    path.write_bytes(path.read_bytes()[:-700])
+    with pytest.raises(InputError, match=r"ecg\.dcm"):
+        read_ecg(path)
+
+
+def test_dicom_without_waveform_is_refused(tmp_path):
+    with pytest.raises(InputError, match="WaveformSequence"):
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", []))
+
+
+def test_file_of_no_known_kind_is_refused(tmp_path):
+    (tmp_path / "ecg.xyz").write_text("hello")
+    with pytest.raises(InputError, match="neither a WFDB record"):
+        read_ecg(tmp_path / "ecg.xyz")
+
+
+@pytest.mark.parametrize("kind", ["wfdb", "csv"])
+def test_missing_samples_are_counted_by_lead(tmp_path, kind):
+    signal = STEPS_UV / 1000.0
+    signal[100:130, 1] = np.nan
+    write = {"wfdb": lambda: write_wfdb(tmp_path, signal=signal)}
+    write["csv"] = lambda: write_csv(tmp_path / "ecg.csv", signal=signal)
+    with pytest.raises(InputError, match="lead II: 30 of 1000"):
+        read_ecg(write[kind]())
+
+
+def test_every_constant_lead_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"lead I: constant.*lead II: constant"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", signal=np.full((100, 2), 0.5)))
+
+
+@pytest.mark.parametrize("kind", ["wfdb", "dicom"])
+def test_unit_that_is_no_voltage_is_refused(tmp_path, kind):
+    path = write_wfdb(tmp_path, units="mmHg") if kind == "wfdb" else None
+    path = path or write_dicom(tmp_path / "ecg.dcm", unit="mm[Hg]")
+    with pytest.raises(InputError, match="voltage"):
+        read_ecg(path)
+
+
+def test_csv_gap_is_refused(tmp_path):
+    times_s = np.arange(1000) / RATE_HZ
+    times_s[600:] += 1 / RATE_HZ
+    with pytest.raises(InputError, match=r"not evenly spaced: 0\.008 s after 2\.396"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+def test_csv_change_of_rate_is_refused(tmp_path):
+    times_s = np.cumsum(np.where(np.arange(1000) < 500, 0.004, 0.005))
+    with pytest.raises(InputError, match="not evenly spaced"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+def test_csv_time_running_back_is_refused(tmp_path):
+    times_s = np.arange(1000) / RATE_HZ
+    times_s[[10, 11]] = times_s[[11, 10]]
+    with pytest.raises(InputError, match="does not rise"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "first row"),
+        ("t,I\n0,1\n", "first row"),
+        ("time_s,I\n", "2 or more"),
+        ("time_s,I\n0,1\n0.1,x\n", "line 3"),
+        ("time_s,I\n0,1\n0.1,1,2\n", "line 3"),
+        ("time_s,I\n0,1\n0.1,2\n0.2", "line 4"),
+        ("time_s,I\n0,1\nnan,2\n0.2,3\n", "does not rise"),
+    ],
+)
+def test_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
+    (tmp_path / "ecg.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_ecg(tmp_path / "ecg.csv")

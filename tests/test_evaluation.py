@@ -1,0 +1,234 @@
+"""Metrics against shapes whose distances, overlaps and volumes are known in closed form."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import InputError
+from pipeline.evaluation.metrics import (
+    closedness,
+    dice,
+    distances_mm,
+    ejection_fraction,
+    emptying,
+    phase_error,
+    surface_distance,
+    surface_samples,
+    target_registration_error_mm,
+    volumes_ml,
+)
+from pipeline.geometry import Float, MovingSurface, Surface, transform_points
+
+SPHERE_POINTS = 6000
+
+
+def outward_hull(points_mm: Float) -> Surface:
+    """Convex hull as a surface; independent of the code under test."""
+    hull = ConvexHull(points_mm)
+    triangles = hull.simplices.astype(np.int64)
+    a, b, c = (points_mm[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles[inward] = triangles[inward, ::-1]
+    return Surface(points_mm, triangles)
+
+
+def sphere(radius_mm: float, centre_mm: tuple[float, float, float] = (0, 0, 0)) -> Surface:
+    """Fibonacci sphere: nearly equal triangles."""
+    k = np.arange(SPHERE_POINTS) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / SPHERE_POINTS), np.pi * (1 + 5**0.5) * k
+    unit = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
+    return outward_hull(radius_mm * unit + np.array(centre_mm))
+
+
+def sag(radius_mm: float) -> float:
+    """Depth of the deepest flat facet below its sphere: R - sqrt(R^2 - e^2/3), longest edge e."""
+    surface = sphere(radius_mm)
+    corners = surface.vertices_mm[surface.triangles]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    return float(radius_mm - np.sqrt(radius_mm**2 - edge**2 / 3))
+
+
+def box(side_mm: float, corner_mm: tuple[float, float, float] = (0, 0, 0)) -> Surface:
+    corners = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+    return outward_hull(side_mm * corners + np.array(corner_mm))
+
+
+@pytest.mark.parametrize(("inner_mm", "outer_mm"), [(20.0, 25.0), (30.0, 30.5), (10.0, 40.0)])
+def test_concentric_spheres_are_apart_by_the_difference_of_radii(inner_mm, outer_mm):
+    """Facets sag below either sphere, so the gap is known to one sag of the outer."""
+    found = surface_distance(sphere(inner_mm), sphere(outer_mm), samples=3000)
+
+    gap_mm, slack_mm = outer_mm - inner_mm, sag(outer_mm)
+    for value in (found.mean_mm, found.hausdorff95_mm, found.largest_mm):
+        assert value == pytest.approx(gap_mm, abs=slack_mm)
+
+
+def test_shifted_spheres_follow_the_closed_form():
+    """From x on one sphere, at angle t to the shift s, the other is | |x - s| - R | away.
+
+    cos t is uniform on a sphere, so mean and percentile are integrals over one variable. The two
+    directions are mirror images. Stratified samples err by less than range / sqrt(samples).
+    """
+    radius_mm, shift_mm, samples = 30.0, 8.0, 20_000
+    found = surface_distance(sphere(radius_mm), sphere(radius_mm, (0, 0, shift_mm)), samples)
+
+    cosine = (np.arange(200_000) + 0.5) / 100_000 - 1
+    far = np.sqrt(radius_mm**2 + shift_mm**2 - 2 * radius_mm * shift_mm * cosine)
+    exact = np.abs(far - radius_mm)
+    slack_mm = 2 * sag(radius_mm) + shift_mm / np.sqrt(samples)
+    assert found.mean_mm == pytest.approx(exact.mean(), abs=slack_mm)
+    assert found.hausdorff95_mm == pytest.approx(np.percentile(exact, 95), abs=slack_mm)
+    assert found.largest_mm == pytest.approx(shift_mm, abs=slack_mm)
+
+
+def test_a_surface_is_no_distance_from_itself():
+    found = surface_distance(box(10.0), box(10.0))
+    assert found.largest_mm < 1e-9
+
+
+def test_distance_to_a_cube_is_exact_and_signed():
+    """A box's distance in closed form: |max(q, 0)| + min(max q, 0), q = |x - centre| - half."""
+    points = np.random.default_rng(1).uniform(-20, 30, (500, 3))
+    q = np.abs(points - 5.0) - 5.0
+    exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+    np.testing.assert_allclose(distances_mm(points, box(10.0)), exact, atol=1e-9)
+
+
+def test_distances_survive_coordinates_that_single_precision_would_round():
+    """At 1e5 mm a float32 steps by 8 um; double precision keeps 1e-9 mm."""
+    corner = (1e5, 1e5, 1e5)
+    point = np.array([[1e5 + 5, 1e5 + 5, 1e5 + 10 + 1e-4]])
+    assert distances_mm(point, box(10.0, corner))[0] == pytest.approx(1e-4, abs=1e-9)
+
+
+def test_samples_fall_on_faces_in_the_measure_of_their_area():
+    """A bar of 1 x 1 x 8: each end has 1/34 of the area; stratified, so within two strata."""
+    bar = Surface(box(1.0).vertices_mm * (1, 1, 8), box(1.0).triangles)
+    points = surface_samples(bar, 3400)
+    ends = np.isclose(points[:, 2], 0) | np.isclose(points[:, 2], 8)
+    # Two triangles an end are four runs of strata, each cut off at both its ends.
+    assert abs(np.count_nonzero(ends) - 200) <= 8
+    assert np.abs(distances_mm(points, bar)).max() < 1e-12
+
+
+def test_samples_are_the_same_for_the_same_seed():
+    surface = sphere(10.0)
+    np.testing.assert_array_equal(surface_samples(surface, 50, 3), surface_samples(surface, 50, 3))
+    assert not np.array_equal(surface_samples(surface, 50, 3), surface_samples(surface, 50, 4))
+
+
+def test_dice_of_boxes_that_overlap_by_half():
+    found, truth = np.zeros((2, 10, 10, 10), np.uint8)
+    found[:, :, :4], truth[:, :, 2:6] = 2, 2
+    truth[0, 0, 9], found[0, 0, 9] = 3, 4
+    assert dice(found, truth, {"muscle": 2, "lost": 3, "made_up": 4, "absent": 5}) == {
+        "muscle": 0.5,
+        "lost": 0.0,
+        "made_up": 0.0,
+    }
+
+
+def test_dice_refuses_arrays_of_different_shape():
+    with pytest.raises(InputError, match="share a shape"):
+        dice(np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8), {"a": 1})
+
+
+def rigid(turn: Float, shift: Float) -> Float:
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    transform[:3, 3] = shift
+    return transform
+
+
+vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
+
+
+@settings(max_examples=30, deadline=None)
+@given(vectors, vectors, vectors)
+def test_target_registration_error_of_a_shift_is_its_length(turn, place, shift):
+    """Whatever the true pose, a shift in the MR frame misses every target by its length."""
+    truth = rigid(turn, 100 * place)
+    targets = np.random.default_rng(0).normal(0, 50, (9, 3))
+    found = rigid(np.zeros(3), shift) @ truth
+    errors = target_registration_error_mm(found, truth, targets)
+    np.testing.assert_allclose(errors, np.linalg.norm(shift), atol=1e-9)
+
+
+def test_target_registration_error_of_a_turn_is_the_chord():
+    """A turn by a about the z axis moves a point at radius r by 2 r sin(a / 2)."""
+    angle, radius = 0.1, 50.0
+    errors = target_registration_error_mm(
+        rigid(np.array([0, 0, angle]), np.zeros(3)), np.eye(4), np.array([[radius, 0, 7.0]])
+    )
+    assert errors[0] == pytest.approx(2 * radius * np.sin(angle / 2), abs=1e-12)
+
+
+@given(st.floats(0, 0.999), st.floats(-0.499, 0.499))
+def test_phase_error_knows_no_seam(phase, late):
+    """A known lateness comes back with its sign on either side of the R peak."""
+    found = phase_error(np.array([(phase + late) % 1.0]), np.array([phase]))
+    assert found[0] == pytest.approx(late, abs=1e-12)
+
+
+def test_half_a_beat_early_and_late_are_one_value():
+    np.testing.assert_array_equal(phase_error(np.array([0.5, 0.0]), np.array([0.0, 0.5])), -0.5)
+
+
+def test_a_cube_is_a_solid():
+    found = closedness(box(1.0, (50, 60, 70)))
+    assert (found.boundary_edges, found.components, found.outward) == (0, 1, True)
+    assert found.is_solid
+
+
+def test_a_missing_triangle_leaves_three_open_edges():
+    cube = box(1.0)
+    found = closedness(Surface(cube.vertices_mm, cube.triangles[1:]))
+    assert found.boundary_edges == 3
+    assert not found.is_solid
+
+
+def test_a_cube_inside_out_is_not_outward():
+    cube = box(1.0)
+    found = closedness(Surface(cube.vertices_mm, cube.triangles[:, ::-1]))
+    assert (found.boundary_edges, found.outward) == (0, False)
+
+
+def test_a_piece_inside_out_shows_beside_a_large_good_one():
+    """The sum of volumes would hide it."""
+    large, small = box(10.0), box(1.0, (20, 0, 0))
+    both = Surface(
+        np.concatenate([large.vertices_mm, small.vertices_mm]),
+        np.concatenate([large.triangles, small.triangles[:, ::-1] + 8]),
+    )
+    found = closedness(both)
+    assert (found.boundary_edges, found.components, found.outward) == (0, 2, False)
+
+
+def test_volumes_and_ejection_fraction_of_a_cube_that_shrinks():
+    """Sides 50, 40 and 30 mm: 125, 64 and 27 ml; the fraction is 98 / 125."""
+    cube = box(1.0)
+    sides = np.array([50.0, 40.0, 30.0])
+    path = sides[:, None, None] * cube.vertices_mm
+    found = volumes_ml(MovingSurface(path, cube.triangles, np.array([0.0, 0.3, 0.6])))
+    np.testing.assert_allclose(found, [125, 64, 27], rtol=1e-12)
+    np.testing.assert_allclose(emptying(found), [0, 61 / 125, 98 / 125], atol=1e-12)
+    assert ejection_fraction(found) == pytest.approx(98 / 125)
+
+
+@settings(max_examples=15, deadline=None)
+@given(vectors, vectors)
+def test_moving_both_surfaces_together_changes_no_distance(turn, place):
+    """Distances belong to the pair, not to the frame."""
+    pose = rigid(turn, 50 * place)
+    first, second = box(10.0), box(14.0, (-1, -2, -3))
+    moved = [Surface(transform_points(pose, s.vertices_mm), s.triangles) for s in (first, second)]
+    here, there = surface_distance(first, second, 500), surface_distance(*moved, 500)
+    assert there.mean_mm == pytest.approx(here.mean_mm, abs=1e-9)
+    assert there.hausdorff95_mm == pytest.approx(here.hausdorff95_mm, abs=1e-9)

@@ -1,0 +1,317 @@
+"""Baking: the grid, the certificate, what is refused; and surfaces of one's own."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import pyvista
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, bake_small, ball_and_core
+from field_shapes import beating, box, lumpy, sag, sphere
+
+from pipeline.config import Settings
+from pipeline.errors import InputError
+from pipeline.field import BakeSettings, Fixture, ForceField
+from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
+from pipeline.field.certificate import points_about, vtk_distance
+from pipeline.field.kernels import largest_change, largest_steps, node_forces
+from pipeline.field.store import verify_field
+from pipeline.geometry import MovingSurface
+from pipeline.own_surfaces import bake_own_surfaces
+
+BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
+
+
+def test_grid_holds_all_phases_with_the_margin():
+    moving = ball_and_core()["ball"]
+
+    grid = grid_around([moving], BakeSettings(spacing_mm=3.0, margin_mm=16))
+
+    reach = RADII_MM.max() + 16
+    low, high = np.array(grid.origin_mm), grid.upper_mm
+    # An icosphere's corners do not all reach the radius along the axes.
+    assert (low <= -reach + 0.5).all()
+    assert (high >= reach - 0.5).all()
+    assert (high - low < 2 * reach + 3).all()
+    np.testing.assert_allclose(low, -high, atol=1e-9)
+
+
+def test_certificate_is_what_an_independent_check_finds(tmp_path):
+    """The whole field against VTK at other points than the certificate's own."""
+    surface = lumpy(3)
+    moving = {"lump": SurfaceSeries((surface,), np.array([0.0]))}
+    fixture = Fixture(structure="lump", kind="guidance", delta_mm=8.0, f_max_n=2.0)
+    settings = BakeSettings(spacing_mm=2.0, samples=4000)
+
+    said = bake_field(tmp_path / "f.zarr", moving, {"hold": fixture}, settings)
+
+    field = ForceField.open(tmp_path / "f.zarr")
+    asked = points_about(surface, np.random.default_rng(99), 4000, 15.0)
+    error = np.abs(field.distance_mm(asked, 0) - vtk_distance(surface, asked))
+    assert said == field.accuracy
+    assert said["sign_errors"] == 0
+    # Stored as float32 of at most 40 mm.
+    assert said["node_error_max_mm"] <= 40 * 2.0**-23
+    # Percentiles of 4000 draws: 1 % +- 0.16 % lie above; the density there lets that be 30 %.
+    assert np.percentile(error, 99) == pytest.approx(said["distance_error_p99_mm"], rel=0.3)
+    assert 0.3 < error.max() / said["distance_error_max_mm"] < 3
+    # The interpolant of an exact field of slope 1 errs by less than half a voxel anywhere.
+    assert said["distance_error_max_mm"] < 1.0
+
+
+def test_certificate_has_a_figure_for_each_part(tmp_path):
+    said = bake_small(tmp_path / "f.zarr")
+
+    assert set(said["structures"]) == {"ball", "core"}
+    assert set(said["fixtures"]) == set(FIXTURES)
+    assert len(said["structures"]["ball"]["distance_error_max_mm_by_phase"]) == len(PHASES)
+    largest = max(one["distance_error_max_mm"] for one in said["structures"].values())
+    assert said["distance_error_max_mm"] == largest
+    steps = [one["force_step_max_n"] for one in said["fixtures"].values()]
+    assert said["force_step_max_n"] == max(steps)
+
+
+def test_force_change_is_bounded_by_stiffness_and_motion(tmp_path):
+    """Truth: at a node the force changes by stiffness times motion, and its direction turns only
+    where facets or the middle of the ball make it."""
+    said = bake_small(tmp_path / "f.zarr")["fixtures"]["stay_in"]
+    motion_mm = np.abs(np.diff(RADII_MM, append=RADII_MM[0]))
+    gap_ms = np.diff(PHASES, append=PHASES[0] + 1) * RR_S * 1000
+    stiffness = FIXTURES["stay_in"].stiffness_n_per_m / 1000
+
+    # Turning of the facets' normals within the largest force: an edge over the radius.
+    turning = 1.5 * 0.3
+    assert said["force_change_max_n"] <= stiffness * motion_mm.max() + turning
+    assert said["force_change_max_n_per_ms"] <= ((stiffness * motion_mm + turning) / gap_ms).max()
+    # The fastest motion, 3 mm in a quarter beat, is felt where the potential is steepest.
+    assert said["force_change_max_n"] >= 0.5 * stiffness * motion_mm.max()
+
+
+def test_rates_are_unknown_without_a_heart_rate(tmp_path):
+    said = bake_small(tmp_path / "f.zarr", rr_s=None)
+
+    assert said["force_change_max_n_per_ms"] is None
+    assert said["force_change_max_n"] > 0
+    assert ForceField.open(tmp_path / "f.zarr").rr_s is None
+
+
+def test_steps_between_nodes_are_plain_differences():
+    """The compiled measures against NumPy on random values."""
+    rng = np.random.default_rng(0)
+    distance = rng.normal(scale=4, size=(6, 7, 8)).astype(np.float32)
+    force, other = rng.normal(size=(2, 6, 7, 8, 3)).astype(np.float32)
+    near = np.abs(distance) <= 3
+    found = np.empty((2, 3))
+    largest_steps(force, distance, 3.0, found)
+
+    for axis in range(3):
+        along = 2 - axis
+        steps = np.linalg.norm(np.diff(force.astype(float), axis=along), axis=-1)
+        low, high = np.delete(near, -1, along), np.delete(near, 0, along)
+        assert found[0, axis] == pytest.approx(steps.max(), rel=1e-6)
+        assert found[1, axis] == pytest.approx(steps[low & high].max(), rel=1e-6)
+    changes = np.linalg.norm(force.astype(float) - other, axis=-1)
+    assert largest_change(force, other) == pytest.approx(changes.max(), rel=1e-6)
+
+
+def test_forces_at_nodes_are_the_readers(tmp_path):
+    bake_small(tmp_path / "f.zarr")
+    field = ForceField.open(tmp_path / "f.zarr")
+    nodes = field.grid.nodes_mm()
+    for name, law in field.fixtures.items():
+        stored = field.stored_distance_mm(law.structure, 1)
+        found = np.empty((*stored.shape, 3), dtype=np.float32)
+        law_numbers = (law.side_code, law.resolved_delta_mm, law.m, law.f_max_n)
+        node_forces(stored, np.array(field.grid.spacing_mm), *law_numbers, found)
+
+        expected = field.force_n(nodes.reshape(-1, 3), PHASES[1], name).reshape(found.shape)
+
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2 * 2.0**-23)
+
+
+def test_only_what_is_needed_is_baked(tmp_path):
+    settings = SETTINGS.model_copy(update={"structures": ("core",)})
+    fixtures = {"guide": FIXTURES["guide"]}
+    seen = []
+
+    bake_field(
+        tmp_path / "f.zarr",
+        ball_and_core(),
+        fixtures,
+        settings,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+
+    assert ForceField.open(tmp_path / "f.zarr").structures == ("ball", "core")
+    assert seen == [(k + 1, 2 * len(PHASES)) for k in range(2 * len(PHASES))]
+    assert sorted(one.name for one in (tmp_path / "f.zarr" / "potential").iterdir()) == [
+        "guide",
+        "zarr.json",
+    ]
+
+
+def test_triangles_may_differ_between_phases(tmp_path):
+    """A coarse and a fine ball: between them lies the mean of both."""
+    series = SurfaceSeries((sphere(20, 2), sphere(16, 4)), np.array([0.0, 0.5]))
+    fixtures = {"g": Fixture(structure="ball", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
+
+    bake_field(tmp_path / "f.zarr", {"ball": series}, fixtures, SETTINGS)
+
+    field = ForceField.open(tmp_path / "f.zarr")
+    near = np.array([[18.0, 0, 0], [0, 0, -18.0]])
+    # Voxels of 3 mm at radius 16: h^2 / 8 * 2 / 16, and the facets.
+    bound = 9 / 8 * 2 / 16 + sag(sphere(20, 2), 20)
+    np.testing.assert_allclose(field.distance_mm(near, 0.25), 0, atol=bound)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            {"fixtures": {"g": FIXTURES["guide"].model_copy(update={"structure": "heart"})}},
+            "fixture g needs 'heart'; the surfaces that exist are ball, core, unused",
+        ),
+        ({"settings": BakeSettings(structures=("aorta",))}, "bake.structures aorta needs 'aorta'"),
+        ({"fixtures": {}}, "no fixture"),
+        ({"fixtures": {"../up": FIXTURES["guide"]}}, r"fixture name '\.\./up'"),
+        ({"settings": BakeSettings(spacing_mm=0.1)}, r"would take \d+ MB .* spacing_mm = 0\.\d+ w"),
+        ({"mr_from_tracker": np.diag([2.0, 1, 1, 1])}, "mr_from_tracker"),
+    ],
+)
+def test_wrong_requests_are_refused_before_anything_is_written(tmp_path, change, words):
+    given = {"surfaces": ball_and_core(), "fixtures": FIXTURES, "settings": SETTINGS, **change}
+    with pytest.raises(InputError, match=words):
+        bake_field(tmp_path / "f.zarr", **given)
+    assert not (tmp_path / "f.zarr").exists()
+
+
+def test_the_spacing_that_is_named_would_do():
+    """The message for a field that is too large helps: one try is enough."""
+    settings = BakeSettings(spacing_mm=1.0, largest_store_mb=20)
+    with pytest.raises(InputError) as refusal:
+        bake_field(None, ball_and_core(), FIXTURES, settings)
+    spacing = float(str(refusal.value).split("; spacing_mm = ")[1].split()[0])
+
+    coarser = settings.model_copy(update={"spacing_mm": spacing})
+    grid = grid_around([ball_and_core()["ball"]], coarser)
+
+    assert math.prod(grid.shape) * 4 * len(PHASES) * 5 <= 20e6
+
+
+def test_unusable_surfaces_are_refused_by_phase(tmp_path):
+    surfaces = ball_and_core()
+    core = surfaces["core"].vertices_mm.copy()
+    core[3, 5] = np.nan
+    surfaces["core"] = MovingSurface(core, surfaces["core"].triangles, PHASES)
+    with pytest.raises(InputError, match="core, phase 3: 1 vertices are not finite"):
+        bake_field(tmp_path / "f.zarr", surfaces, FIXTURES, SETTINGS)
+
+    surfaces["core"] = beating(sphere(1, 1), RADII_MM[:3], PHASES[:3])
+    with pytest.raises(InputError, match="core has 3 phases, ball 5"):
+        bake_field(tmp_path / "f.zarr", surfaces, FIXTURES, SETTINGS)
+
+    turned = {"ball": beating(sphere(1, 1), RADII_MM, PHASES[::-1])}
+    with pytest.raises(InputError, match="must rise"):
+        bake_field(tmp_path / "f.zarr", turned, {"guide": FIXTURES["guide"]}, SETTINGS)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three phases of a box that grows, in three file formats, and a ball that rests."""
+    folder = tmp_path / "own"
+    (folder / "ball").mkdir(parents=True)
+    for number, ending in enumerate(("vtp", "stl", "ply")):
+        save(folder / f"box_{number:03d}.{ending}", box((-19, -18, -17), (19 + number, 18, 17)))
+    save(folder / "ball" / "000.vtp", sphere(5, 2))
+    return folder
+
+
+def save(path, surface):
+    pyvista.PolyData.from_regular_faces(surface.vertices_mm, surface.triangles).save(path)
+
+
+def own_settings() -> Settings:
+    return Settings(bake=BakeSettings(spacing_mm=4.0, samples=100), fixtures=BOX_FIXTURE)
+
+
+def test_surfaces_of_ones_own(folder, tmp_path):
+    field = ForceField.open(bake_own_surfaces(folder, tmp_path / "out", own_settings()))
+
+    np.testing.assert_allclose(field.phases, [0, 1 / 3, 2 / 3])
+    assert field.structures == ("box",)
+    # Two voxels and more from any edge the distance of a flat wall is linear: nothing to
+    # interpolate wrongly.
+    for number in range(3):
+        found = field.distance_mm([[20.0 + number, 0, 0]], number / 3)
+        assert found[0] == pytest.approx(1.0, abs=1e-6)
+    assert "own_surfaces" not in field.source
+    assert set(field.source["surfaces"]) == {
+        "box_000.vtp",
+        "box_001.stl",
+        "box_002.ply",
+        "ball/000.vtp",
+    }
+    verify_field(tmp_path / "out" / "field.zarr")
+    assert {one.name for one in (tmp_path / "out").iterdir()} == {".lock", "field.zarr"}
+
+
+def test_timing_and_tracker_of_ones_own(folder, tmp_path):
+    timing = {"phases": [0.1, 0.2, 0.6], "rr_s": 0.9, "mr_from_tracker": np.eye(4).tolist()}
+    (folder / "phases.json").write_text(json.dumps(timing))
+
+    field = ForceField.open(bake_own_surfaces(folder, tmp_path / "out", own_settings()))
+
+    np.testing.assert_array_equal(field.phases, [0.1, 0.2, 0.6])
+    assert field.rr_s == 0.9
+    np.testing.assert_array_equal(field.mr_from_tracker, np.eye(4))
+
+
+def test_a_single_file_is_a_surface_at_rest(tmp_path):
+    (tmp_path / "own").mkdir()
+    save(tmp_path / "own" / "box.ply", box((-9, -8, -7), (9, 8, 7)))
+
+    field = ForceField.open(bake_own_surfaces(tmp_path / "own", tmp_path / "out", own_settings()))
+
+    still = field.force_n(np.tile([[12.0, 1, 1]], (3, 1)), [0.0, 0.4, 0.9])
+    assert np.ptp(still, axis=0).max() == 0
+    assert field.accuracy["force_change_max_n"] == 0
+
+
+def open_box(folder):
+    mesh = pyvista.read(folder / "box_000.vtp")
+    mesh.remove_cells([0, 1]).save(folder / "box_000.vtp")
+
+
+def inward_box(folder):
+    one = box((-9, -8, -7), (9, 8, 7))
+    mesh = pyvista.PolyData.from_regular_faces(one.vertices_mm, one.triangles[:, ::-1])
+    mesh.save(folder / "box_001.stl")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (open_box, r"box_000\.vtp: is not closed, 4 edges"),
+        (inward_box, r"box_001\.stl: faces inwards"),
+        (lambda f: (f / "box_001.stl").unlink(), "box has 2 files, but none numbered 1"),
+        (lambda f: (f / "box_002.ply").write_text("ply\nnothing"), r"box_002\.ply"),
+        (lambda f: save(f / "box_000.stl", box((0, 0, 0), (1, 1, 1))), "same structure and phase"),
+        (lambda f: save(f / "ball" / "001.vtp", sphere(5, 2)), "ball has 2 and another 3 files"),
+        (lambda f: save(f / "ball" / "x.vtp", sphere(5, 2)), r"x\.vtp: in a structure's folder"),
+        (lambda f: (f / "phases.json").write_text('{"phases": [0, 0.5]}'), "2 phases for 3"),
+        (lambda f: (f / "phases.json").write_text('{"phase": []}'), "unknown key"),
+        (lambda f: (f / "phases.json").write_text("{"), r"phases\.json: cannot be read as JSON"),
+        (lambda f: shutil.rmtree(f), "no such folder"),
+        (lambda f: (shutil.rmtree(f), f.mkdir()), r"holds no \.vtp"),
+        (
+            lambda f: [one.unlink() for one in f.glob("box*")],
+            "fixture hold needs 'box'; the surfaces that exist are ball",
+        ),
+    ],
+)
+def test_unusable_folders_are_refused_and_nothing_is_left(folder, tmp_path, damage, words):
+    damage(folder)
+    with pytest.raises(InputError, match=words):
+        bake_own_surfaces(folder, tmp_path / "out", own_settings())
+    assert {one.name for one in (tmp_path / "out").glob("*")} <= {".lock"}

@@ -1,0 +1,297 @@
+"""Questions to a baked field: against closed forms, plain NumPy, and difference quotients."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, TRACKER, bake_small
+from field_shapes import sag, sphere
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import InputError
+from pipeline.field import ForceField
+from pipeline.field.potential import direction_scale, offence, potential, pull
+from pipeline.field.query import query_point
+from pipeline.geometry import Float
+
+places = st.floats(-38, 38)
+points = st.tuples(places, places, places)
+phases = st.floats(0, 1, exclude_max=True)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reader") / "field.zarr"
+    bake_small(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def field(path):
+    return ForceField.open(path)
+
+
+def random_points(count: int, seed: int = 0) -> Float:
+    """Points within 32 mm of the middle, all in the grid."""
+    return np.random.default_rng(seed).uniform(-32, 32, (count, 3))
+
+
+def test_says_what_it_holds(field):
+    np.testing.assert_array_equal(field.phases, PHASES)
+    np.testing.assert_array_equal(field.mr_from_tracker, TRACKER)
+    assert field.rr_s == RR_S
+    assert field.structures == ("ball", "core")
+    assert list(field.fixtures) == list(FIXTURES)
+    for name, fixture in FIXTURES.items():
+        found = field.fixtures[name]
+        assert found.resolved_delta_mm == fixture.resolved_delta_mm
+        assert (found.kind, found.side, found.m) == (fixture.kind, fixture.side, fixture.m)
+    assert field.source == {"shape": "ball"}
+    assert field.accuracy["sign_errors"] == 0
+    assert field.grid.spacing_mm == (3.0, 3.0, 3.0)
+
+
+def test_chunk_files_are_the_field(path, field):
+    """A program with a JSON parser and mmap reads the same values, at every node and phase."""
+    description = json.loads((path / "zarr.json").read_text())["attributes"]["beatfield"]
+    grid = description["grid"]
+    axes = [
+        origin + spacing * np.arange(count)
+        for origin, spacing, count in zip(
+            grid["origin_mm"], grid["spacing_mm"], grid["shape_zyx"][::-1], strict=True
+        )
+    ]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    nodes = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    for k, phase in enumerate(description["phases"]):
+        chunk = path / "distance" / "ball" / "c" / str(k) / "0" / "0" / "0"
+        raw = np.memmap(chunk, dtype="<f4", mode="r").astype(float)
+
+        # Interpolation at a node is that node's value but for rounding of its place, 1e-14 mm.
+        np.testing.assert_allclose(field.distance_mm(nodes, phase), raw, rtol=0, atol=1e-11)
+
+        height = potential(np.abs(raw), FIXTURES["guide"].resolved_delta_mm, 2)
+        np.testing.assert_allclose(field.potential(nodes, phase), height, rtol=0, atol=1e-11)
+        stored = np.memmap(path / "potential/guide/c" / str(k) / "0/0/0", dtype="<f4", mode="r")
+        np.testing.assert_allclose(stored, height, rtol=0, atol=2**-24)
+
+
+def test_force_is_the_formula_on_plain_numpy(path, field):
+    """The paper's formula with np.gradient, at all nodes within the grid."""
+    k, law = 2, FIXTURES["guide"]
+    shape = field.grid.shape
+    chunk = path / "distance" / "ball" / "c" / str(k) / "0" / "0" / "0"
+    distance = np.memmap(chunk, dtype="<f4", mode="r", shape=shape).astype(float)
+    gradient = np.stack(np.gradient(distance, 3.0)[::-1], axis=-1)
+    length = np.linalg.norm(gradient, axis=-1, keepdims=True)
+    height = 1 - np.exp(-((distance**2 / (2 * law.resolved_delta_mm**2)) ** law.m))
+    down = -np.sign(distance)[..., None] * gradient / np.maximum(length, 0.5)
+    expected = law.f_max_n * height[..., None] * down
+
+    found = field.force_n(field.grid.nodes_mm().reshape(-1, 3), PHASES[k])
+
+    np.testing.assert_allclose(found.reshape(*shape, 3), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("phase", [*PHASES, 0.33, 0.9, 0.0, 0.02])
+def test_distance_is_that_of_the_ball(field, phase):
+    """Truth: a ball whose radius changes linearly between the phases, the cycle closed."""
+    radius = np.interp(phase, [*(PHASES - 1), *PHASES, *(PHASES + 1)], np.tile(RADII_MM, 3))
+    asked = random_points(500)
+    exact = np.linalg.norm(asked, axis=1) - radius
+
+    error = np.abs(field.distance_mm(asked, phase) - exact)
+
+    # Linear interpolation errs by at most h^2 / 8 times the sum of the second derivatives, 2 / r
+    # for the distance from a point r away; the cubic one is better wherever that is small.
+    r = np.linalg.norm(asked, axis=1)
+    clear = r > 9
+    bound = 3.0**2 / 8 * 2 / (r[clear] - 3) + sag(sphere(20, 3), 20)
+    assert (error[clear] <= bound).all()
+    # A quarter of the time between two phases moves this surface by less than it errs by.
+    assert np.median(error) < 0.1
+
+
+@given(points, phases)
+def test_gradient_is_the_slope_of_the_distance(field, point, phase):
+    # Rounding of values of up to 50 mm and truncation meet near this step.
+    step = 1e-4
+    shifts = step * np.eye(3)
+    around = np.array(point) + np.concatenate([shifts, -shifts])
+    rise = field.distance_mm(around, phase)
+    if not field.contains(around).all():
+        return
+
+    slope = (rise[:3] - rise[3:]) / (2 * step)
+
+    # Third derivatives jump at voxel faces; in between, values of 50 mm at nodes 3 mm apart bound
+    # the second derivative by 1 / mm, so that a one-sided step errs by 1e-4.
+    np.testing.assert_allclose(field.gradient([point], phase)[0], slope, rtol=0, atol=1e-4)
+
+
+@given(points, phases, st.sampled_from(sorted(FIXTURES)))
+def test_potential_and_force_are_the_formulas_on_the_distance(field, point, phase, name):
+    law = FIXTURES[name]
+    distance = field.distance_mm([point], phase, law.structure)
+    gradient = field.gradient([point], phase, law.structure)
+    delta = law.resolved_delta_mm
+
+    height = potential(offence(distance, law.side_code), delta, law.m)
+    size = pull(distance, law.side_code, delta, law.m)
+    force = -law.f_max_n * size[:, None] * gradient
+    force *= direction_scale(np.linalg.norm(gradient, axis=1))[:, None]
+
+    np.testing.assert_array_equal(field.potential([point], phase, name), height)
+    np.testing.assert_allclose(field.force_n([point], phase, name), force, rtol=1e-12, atol=1e-15)
+    assert np.linalg.norm(force) <= law.f_max_n * (1 + 1e-12)
+
+
+@given(points, phases, st.sampled_from(sorted(FIXTURES)))
+def test_force_points_down_the_potential(field, point, phase, name):
+    """Where the potential is steep enough to tell, and the direction is a unit vector."""
+    force = field.force_n([point], phase, name)[0]
+    size = np.linalg.norm(force)
+    if size < 1e-3:
+        return
+    step = 1e-3
+    ahead = field.potential(np.array([point]) + step * force / size, phase, name)
+
+    assert ahead <= field.potential([point], phase, name) + 1e-9
+
+
+def test_forbidden_regions_push_back_and_leave_alone(field):
+    outside, inside = np.array([[30.0, 1, 2]]), np.array([[12.0, 1, 2]])
+
+    assert field.force_n(outside, 0.05, "stay_in")[0, 0] < -1
+    np.testing.assert_array_equal(field.force_n(inside, 0.05, "stay_in"), 0)
+    np.testing.assert_array_equal(field.force_n(inside, 0.05, "stay_out"), 0)
+    assert field.force_n([[6.0, 1, 1]], 0.05, "stay_out")[0, 0] > 0.3
+
+
+def longest_step(values: Float) -> float:
+    """Largest change between one sample and the next."""
+    return float(np.linalg.norm(np.diff(values, axis=0), axis=1).max())
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+@pytest.mark.parametrize("seed", range(4))
+def test_force_has_no_step_in_space(field, name, seed):
+    """Halving the distance between samples halves the largest change: no jump at any face."""
+    ends = random_points(2, seed)
+
+    def largest(count: int) -> float:
+        line = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
+        return longest_step(field.force_n(line, 0.3, name))
+
+    # A jump would stay; 0.55 leaves room for the sampling of the steepest place.
+    assert largest(40_001) <= 0.55 * largest(20_001) + 1e-12
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_force_has_no_step_in_time_where_the_cycle_closes_either(field, name):
+    for point in random_points(4, seed=3):
+
+        def largest(count: int, point: Float = point) -> float:
+            moments = np.linspace(-0.5, 1.5, count)
+            return longest_step(field.force_n(np.tile(point, (count, 1)), moments, name))
+
+        assert largest(20_001) <= 0.55 * largest(10_001) + 1e-12
+
+
+def test_force_passes_through_zero_at_the_middle(field):
+    """The medial axis of a ball is its middle: the direction turns round there."""
+    line = np.linspace(-4, 4, 2001)[:, None] * np.array([1.0, 0.3, 0.1])
+    force = field.force_n(line, 0.05)
+    middle = field.force_n([[0.0, 0, 0]], 0.05)[0]
+
+    assert np.linalg.norm(force[0]) > 1.9
+    assert force[0, 0] * force[-1, 0] < 0
+    # The nodes about the middle are not placed evenly about it, so it is near zero, not zero.
+    assert np.linalg.norm(middle) < 0.7
+    assert np.linalg.norm(force, axis=1).min() < 0.2
+    # Stated rate: the direction is twice the gradient, and the cubic through the values h, 0, h, 2h
+    # about a kink turns its slope by at most 4 / h.
+    assert longest_step(force) / np.linalg.norm(line[1] - line[0]) < 2.0 * 2 * 4 / 3
+
+
+@given(st.tuples(*[st.floats(-200, 200)] * 3), phases)
+def test_outside_the_grid_the_nearest_boundary_point_answers(field, point, phase):
+    grid = field.grid
+    moved = np.clip(point, grid.origin_mm, grid.upper_mm)
+
+    np.testing.assert_array_equal(field.force_n([point], phase), field.force_n([moved], phase))
+    assert field.contains([moved])[0]
+    assert field.contains([point])[0] == np.array_equal(point, moved)
+
+
+@given(points, phases, st.integers(-3, 3))
+def test_only_the_fraction_of_a_phase_counts(field, point, phase, beats):
+    whole = field.distance_mm([point], phase)
+
+    # Adding whole beats rounds the phase by 4e-16; the surface moves under 100 mm a beat.
+    np.testing.assert_allclose(field.distance_mm([point], phase + beats), whole, atol=1e-12)
+
+
+def test_a_phase_each_is_the_same_as_one_at_a_time(field):
+    asked, moments = random_points(60), np.random.default_rng(1).uniform(-1, 2, 60)
+
+    together = field.force_n(asked, moments)
+
+    alone = [field.force_n([p], t)[0] for p, t in zip(asked, moments, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+
+
+def test_no_points_no_answers(field):
+    assert field.force_n(np.empty((0, 3)), 0.1).shape == (0, 3)
+    assert field.distance_mm(np.empty((0, 3)), 0.1).shape == (0,)
+
+
+@pytest.mark.parametrize("tiny", [-1e-18, -1e-300, 1 - 1e-17, 0.05 - 1e-18])
+def test_phases_beside_the_seam_are_places_in_the_cycle(field, tiny):
+    assert np.isfinite(field.force_n([[1.0, 2, 3]], tiny)).all()
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda f: f.force_n([1, 2, 3], 0), r"must be \(n, 3\)"),
+        (lambda f: f.force_n([[1, 2]], 0), r"must be \(n, 3\)"),
+        (lambda f: f.force_n([[1, 2, 3], [1, np.nan, 3]], 0), "point 1 is not finite"),
+        (lambda f: f.force_n([[1, 2, 3]], np.inf), "phase must be finite"),
+        (lambda f: f.force_n([[1, 2, 3]], [0.1, 0.2]), "phase must be one number"),
+        (lambda f: f.force_n([[1, 2, 3]], 0, "gide"), "no fixture 'gide'; there are guide, stay"),
+        (lambda f: f.distance_mm([[1, 2, 3]], 0, "bal"), "no structure 'bal'; there are ball, c"),
+    ],
+)
+def test_wrong_questions_are_refused(field, ask, words):
+    with pytest.raises(InputError, match=words):
+        ask(field)
+
+
+def test_query_answers_for_every_fixture(path, field):
+    answers = query_point(path, (14.0, 2, 1), 0.3)
+
+    assert list(answers) == list(FIXTURES)
+    for name, answer in answers.items():
+        assert answer["force_n"] == field.force_n([[14, 2, 1]], 0.3, name)[0].tolist()
+        assert answer["inside_grid"]
+    assert list(query_point(path, (14.0, 2, 1), 0.3, "guide")) == ["guide"]
+    with pytest.raises(InputError, match="no fixture 'x'"):
+        query_point(path, (0.0, 0, 0), 0.3, "x")
+
+
+def test_reading_loads_no_heavy_library(path):
+    """Opening needs NumPy only. A question loads numba, which loads SciPy's linear algebra."""
+    code = (
+        "import sys\n"
+        "from pipeline.field import ForceField\n"
+        "field = ForceField.open(sys.argv[1])\n"
+        "assert not {'numba', 'scipy'} & set(sys.modules)\n"
+        "field.force_n([[1, 2, 3]], 0.5)\n"
+        "heavy = {'zarr', 'SimpleITK', 'vtk', 'vtkmodules', 'pyvista', 'skimage'}\n"
+        "sys.exit(f'loaded {heavy & set(sys.modules)}' if heavy & set(sys.modules) else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code, path], check=True)

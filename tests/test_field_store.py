@@ -1,0 +1,246 @@
+"""The store on disk: the format's promises, and that no damage goes unseen."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, bake_small
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import InputError
+from pipeline.field import ForceField
+from pipeline.field.manifest import canonical_manifest, write_manifest
+from pipeline.field.store import verify_field
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("store") / "field.zarr"
+    bake_small(folder)
+    return folder
+
+
+@pytest.fixture
+def copy(path, tmp_path):
+    return Path(shutil.copytree(path, tmp_path / "field.zarr"))
+
+
+def files_of(path: Path) -> list[Path]:
+    return sorted(one for one in path.rglob("*") if one.is_file())
+
+
+def edit(path: Path, change) -> None:
+    """Change the group's description and seal the store again, as a wrong program would."""
+    description = json.loads((path / "zarr.json").read_text())
+    change(description["attributes"]["beatfield"])
+    (path / "zarr.json").write_text(json.dumps(description))
+    (path / "manifest.json").unlink()
+    write_manifest(path)
+
+
+def test_zarr_python_reads_it(path):
+    import zarr
+
+    group = zarr.open_group(path, mode="r", zarr_format=3)
+    ball = group["distance/ball"]
+
+    assert ball.shape == (len(PHASES), *ForceField.open(path).grid.shape)
+    assert ball.dtype == np.float32
+    assert ball.chunks == (1, *ball.shape[1:])
+    assert ball.compressors == ()
+    centre = tuple(count // 2 for count in ball.shape[1:])
+    # Deepest in the middle, as deep as the radius, but for the way to the nearest node and the
+    # facets.
+    for k, radius in enumerate(RADII_MM):
+        assert float(ball[(k, *centre)]) == pytest.approx(-radius, abs=3 * 3**0.5 / 2 + 0.2)
+    assert set(group["potential"].array_keys()) == set(FIXTURES)
+
+
+def test_description_follows_ome_ngff(path):
+    attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+    grid = attributes["beatfield"]["grid"]
+
+    assert attributes["ome"]["version"] == "0.5"
+    for scale in attributes["ome"]["multiscales"]:
+        array = json.loads((path / scale["datasets"][0]["path"] / "zarr.json").read_text())
+        assert array["dimension_names"] == [axis["name"] for axis in scale["axes"]]
+        steps, start = scale["datasets"][0]["coordinateTransformations"]
+        assert steps["scale"] == [RR_S / len(PHASES), *grid["spacing_mm"][::-1]]
+        assert start["translation"] == [RR_S * PHASES[0], *grid["origin_mm"][::-1]]
+        assert [axis["type"] for axis in scale["axes"]] == ["time", "space", "space", "space"]
+
+
+def test_description_is_that_of_the_format(path):
+    described = json.loads((path / "zarr.json").read_text())["attributes"]["beatfield"]
+
+    assert described["format_version"] == 1
+    assert (described["frame"], described["unit"], described["periodic"]) == ("LPS", "mm", True)
+    assert described["fixtures"]["stay_in"]["side"] == "outside"
+    keys = {"structure", "kind", "side", "gamma_mm", "delta_mm", "m", "f_max_n", "device"}
+    assert all(keys <= set(fixture) for fixture in described["fixtures"].values())
+    volumes = described["structures"]["ball"]["volume_ml"]
+    # Inscribed, so smaller; 642 corners leave out under two percent.
+    assert np.allclose(volumes, 4 / 3 * np.pi * RADII_MM**3 / 1000, rtol=0.02)
+
+
+def test_manifest_lists_every_file(path):
+    listed = json.loads((path / "manifest.json").read_text())["files"]
+
+    found = {one.relative_to(path).as_posix() for one in files_of(path)}
+    assert set(listed) == found - {"manifest.json"}
+    assert all(one["size"] == (path / name).stat().st_size for name, one in listed.items())
+
+
+def test_same_input_same_bytes(path, tmp_path):
+    again = tmp_path / "again.zarr"
+
+    bake_small(again)
+
+    names = [one.relative_to(path) for one in files_of(path)]
+    assert names == [one.relative_to(again) for one in files_of(again)]
+    assert all((path / name).read_bytes() == (again / name).read_bytes() for name in names)
+
+
+def test_a_whole_field_is_verified(path):
+    seen = []
+
+    report = verify_field(path, lambda done, total: seen.append((done, total)))
+
+    assert report.files == len(files_of(path)) - 1
+    assert report.phases == len(PHASES)
+    assert "whole" in str(report)
+    assert seen[-1] == (report.files, report.files)
+
+
+@settings(max_examples=120)
+@given(st.data())
+def test_one_changed_bit_anywhere_is_found(path, data):
+    """Any bit of any byte of any file, the manifest's own included."""
+    file = data.draw(st.sampled_from(files_of(path)))
+    content = bytearray(file.read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1))
+    content[place] ^= 1 << data.draw(st.integers(0, 7))
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(content)
+        with pytest.raises(InputError, match="damaged"):
+            verify_field(path)
+    finally:
+        file.write_bytes(whole)
+    verify_field(path)
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 10**6), st.integers(0, 255))
+def test_one_changed_byte_of_the_manifest_is_found(path, place, value):
+    file = path / "manifest.json"
+    whole = file.read_bytes()
+    content = bytearray(whole)
+    if content[place % len(content)] == value:
+        return
+    content[place % len(content)] = value
+    try:
+        file.write_bytes(content)
+        with pytest.raises(InputError, match="damaged"):
+            verify_field(path)
+    finally:
+        file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("name", ["zarr.json", "distance/ball/c/1/0/0/0", "potential/zarr.json"])
+def test_missing_and_cut_files_are_found(copy, name):
+    (copy / name).write_bytes((copy / name).read_bytes()[:-1])
+    with pytest.raises(InputError, match=rf"{name}: \d+ bytes, the manifest says"):
+        verify_field(copy)
+    (copy / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: is missing"):
+        verify_field(copy)
+
+
+def test_added_files_are_found(copy):
+    (copy / "distance" / "more").write_text("x")
+    (copy / "link").symlink_to("/nowhere")
+
+    with pytest.raises(InputError, match="distance/more: is not in the manifest") as refusal:
+        verify_field(copy)
+    assert "link: is not in the manifest" in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda b: b.update(frame="RAS"), r"beatfield\.frame"),
+        (lambda b: b.update(phases=[0.5, 0.1]), "phases must rise"),
+        (lambda b: b.update(surprise=1), r"beatfield\.surprise: Extra inputs"),
+        (lambda b: b.pop("source"), r"beatfield\.source: Field required"),
+        (lambda b: b["grid"].update(shape_zyx=[3, 3, 3]), r"shape is .* needed \[5, 3, 3, 3\]"),
+        (
+            lambda b: b["fixtures"]["guide"].update(delta_mm=9.0),
+            "guide: phase 0 is not the formula",
+        ),
+        (lambda b: b["fixtures"]["guide"].update(structure="x"), "no structure 'x'"),
+    ],
+)
+def test_sealed_but_wrong_descriptions_are_found(copy, change, words):
+    edit(copy, change)
+    with pytest.raises(InputError, match=words):
+        verify_field(copy)
+
+
+@pytest.mark.parametrize("array", ["distance/ball", "potential/stay_out"])
+def test_sealed_values_that_are_no_numbers_are_found(copy, array):
+    chunk = copy / array / "c" / "3" / "0" / "0" / "0"
+    values = np.fromfile(chunk, dtype="<f4")
+    values[100] = np.nan
+    values.tofile(chunk)
+    edit(copy, lambda described: None)
+
+    with pytest.raises(InputError, match=f"{array}: phase 3"):
+        verify_field(copy)
+
+
+def test_sealed_arrays_of_another_kind_are_found(copy):
+    file = copy / "distance" / "ball" / "zarr.json"
+    file.write_text(file.read_text().replace("little", "big"))
+    edit(copy, lambda described: None)
+
+    with pytest.raises(InputError, match=r"distance/ball/zarr\.json: codecs"):
+        verify_field(copy)
+
+
+def test_a_store_without_manifest_is_none(copy, tmp_path):
+    (copy / "manifest.json").unlink()
+    for read in (verify_field, ForceField.open):
+        with pytest.raises(InputError, match=r"has no manifest\.json, so it is no complete field"):
+            read(copy)
+        with pytest.raises(InputError, match="no such folder"):
+            read(tmp_path / "elsewhere")
+
+
+def test_opening_refuses_what_it_can_see_at_no_cost(copy):
+    whole = (copy / "zarr.json").read_bytes()
+    (copy / "zarr.json").write_bytes(whole + b" ")
+    with pytest.raises(InputError, match="is not what the manifest says"):
+        ForceField.open(copy)
+
+    (copy / "zarr.json").write_bytes(whole)
+    chunk = copy / "distance" / "ball" / "c" / "1" / "0" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-4])
+    with pytest.raises(InputError, match=r"bytes, \d+ were needed"):
+        ForceField.open(copy)
+    chunk.unlink()
+    with pytest.raises(InputError, match="cannot be read"):
+        ForceField.open(copy)
+
+    (copy / "manifest.json").write_text("[]")
+    with pytest.raises(InputError, match=r"manifest\.json: cannot be read"):
+        ForceField.open(copy)
+
+
+def test_a_manifest_has_one_spelling():
+    files = {"b": {"size": 1, "sha256": "x"}, "a": {"size": 2, "sha256": "y"}}
+
+    assert canonical_manifest(files) == canonical_manifest(dict(reversed(files.items())))

@@ -1,0 +1,139 @@
+"""Fixtures: widths, stiffness, devices, and what is refused."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from pipeline.field.fixture import (
+    DEFAULT_FIXTURES,
+    DEVICES,
+    BakeSettings,
+    Fixture,
+    delta_from_gamma,
+    steepest_slope,
+)
+from pipeline.field.potential import potential
+
+GUIDANCE = {"structure": "heart", "kind": "guidance", "delta_mm": 8.0, "f_max_n": 2.0}
+CONFIGS = Path(__file__).parents[1] / "configs" / "fixtures"
+
+
+def fixture(**changes: object) -> Fixture:
+    """A sound fixture with some keys changed; None leaves a key out."""
+    merged = {**GUIDANCE, **changes}
+    return Fixture.model_validate({k: v for k, v in merged.items() if v is not None})
+
+
+@given(st.floats(0.1, 50), st.floats(1e-6, 1 - 1e-6), st.integers(1, 6))
+def test_potential_at_gamma_is_the_level(gamma, level, m):
+    delta = delta_from_gamma(gamma, level, m)
+
+    # A few roundings, magnified by the exponent of up to 12.
+    assert float(potential(gamma, delta, m)) == pytest.approx(level, rel=1e-13)
+
+
+@pytest.mark.parametrize(("m", "published"), [(1, 0.607), (2, 1.077), (3, 1.584)])
+def test_steepest_slope_is_the_published_one(m, published):
+    assert steepest_slope(m) == pytest.approx(published, abs=5e-4)
+
+
+@given(st.integers(1, 8), st.floats(0.5, 30))
+def test_steepest_slope_is_the_potentials(m, delta):
+    """Truth: the largest difference quotient of the formula itself."""
+    q = np.linspace(0, 4 * delta, 40_001)
+    quotients = np.diff(potential(q, delta, m)) / np.diff(q)
+
+    # Mean slopes over 1e-4 delta fall short of the largest by the square of that, times curvature.
+    assert quotients.max() == pytest.approx(steepest_slope(m) / delta, rel=1e-5)
+
+
+def test_gamma_and_delta_describe_the_same_fixture():
+    by_gamma = fixture(delta_mm=None, gamma_mm=3.0, m=2)
+    by_delta = fixture(delta_mm=by_gamma.resolved_delta_mm, m=2)
+
+    assert by_delta.resolved_gamma_mm == pytest.approx(3.0, rel=1e-14)
+    assert by_delta.stiffness_n_per_m == by_gamma.stiffness_n_per_m
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"gamma_mm": 2.0}, "exactly one of delta_mm and gamma_mm, got both"),
+        ({"delta_mm": None}, "exactly one of delta_mm and gamma_mm, got neither"),
+        ({"gamma_level": 0.05}, "gamma_level belongs to gamma_mm"),
+        ({"kind": "forbidden_region"}, "needs side: inside or outside"),
+        ({"side": "inside"}, "side belongs to a forbidden_region"),
+        ({"f_max_n": 3.4}, r"3.4 N is beyond the touch, which exerts 3.3 N"),
+        ({"f_max_n": 9.0, "device": "falcon"}, "beyond the falcon"),
+        ({"f_max_n": 0}, "greater than 0"),
+        ({"m": 0}, "greater than or equal to 1"),
+        ({"m": 1.5}, "valid integer"),
+        ({"delta_mm": float("nan")}, "finite number"),
+        ({"device": "hammer"}, "'touch', 'falcon' or 'omega7'"),
+        ({"kind": "push"}, "'guidance' or 'forbidden_region'"),
+        ({"stifness": 3}, "Extra inputs are not permitted"),
+    ],
+)
+def test_wrong_fixtures_are_refused(changes, words):
+    with pytest.raises(ValidationError, match=words):
+        fixture(**changes)
+
+
+@given(
+    st.floats(0.1, 3.3),
+    st.integers(1, 5),
+    st.sampled_from(["delta_mm", "gamma_mm"]),
+    st.sampled_from(["touch", "omega7"]),
+)
+def test_too_stiff_names_the_smallest_width_that_would_do(force, m, key, device):
+    others = {"delta_mm": None, "f_max_n": force, "m": m, "device": device}
+    with pytest.raises(ValidationError, match="stiffer than") as refusal:
+        fixture(**{**others, key: 1e-3})
+    named = float(str(refusal.value).split(f"{key} = ")[1].split()[0].rstrip(","))
+
+    allowed = fixture(**{**others, key: named})
+
+    assert allowed.stiffness_n_per_m <= DEVICES[device].stiffness_n_per_m * (1 + 1e-9)
+    # Named to a thousandth of a millimetre, rounded up: 0.002 less is too little.
+    if named > 0.003:
+        with pytest.raises(ValidationError, match="stiffer than"):
+            fixture(**{**others, key: named - 0.002})
+
+
+def test_the_falcon_has_no_known_stiffness_limit():
+    assert fixture(device="falcon", delta_mm=0.01).stiffness_n_per_m > 1e5
+
+
+def test_settings_do_not_change_and_know_their_keys():
+    with pytest.raises(ValidationError, match="frozen"):
+        fixture().f_max_n = 1.0
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        BakeSettings.model_validate({"spacing": 1})
+    with pytest.raises(ValidationError, match="greater than or equal to 15"):
+        BakeSettings(margin_mm=10)
+
+
+def test_default_fixtures_are_those_of_the_files():
+    """The files show the defaults; a Touch can render each, or they would not load."""
+    found: dict[str, object] = {}
+    for path in CONFIGS.glob("*.yaml"):
+        found |= yaml.safe_load(path.read_text())["fixtures"]
+
+    assert {name: Fixture.model_validate(one) for name, one in found.items()} == DEFAULT_FIXTURES
+    assert {one.device for one in DEFAULT_FIXTURES.values()} == {"touch"}
+
+
+def test_settings_load_without_numpy():
+    code = (
+        "import sys, pipeline.field.fixture\n"
+        "heavy = {'numpy', 'numba', 'zarr', 'scipy'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

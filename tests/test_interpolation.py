@@ -1,0 +1,245 @@
+"""Planes to volume: shapes whose every cross-section is known by formula."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.imaging.alignment import slice_shifts_mm
+from pipeline.imaging.interpolation import (
+    BAND_MM,
+    REFINE,
+    isotropic_labels,
+    plane_depth_mm,
+)
+
+PIXEL_MM = 1.5
+SIDE = 64
+STEP_MM = 10 / 3
+CENTRE_MM = (SIDE - 1) / 2 * PIXEL_MM
+
+# An outline found on points REFINE a pixel, linearly between pixels, lies within half a point.
+OUTLINE_MM = 0.5 * PIXEL_MM / REFINE
+
+
+def in_plane_mm():
+    axis = np.arange(SIDE) * PIXEL_MM - CENTRE_MM
+    return np.meshgrid(axis, axis)
+
+
+def soft(depth_mm):
+    """Probability whose half-way contour is the zero of a signed depth: a 1-pixel edge."""
+    return 1 / (1 + np.exp(-np.clip(depth_mm / PIXEL_MM * 4, -30, 30)))
+
+
+def stack_of(inside):
+    """One phase of two classes, background and a body of probability ``inside`` (plane, y, x)."""
+    return np.stack([1 - inside, inside], axis=1)[None].astype(np.float32)
+
+
+def volume_of(probability, plane_mm, shifts_mm=None, gap_mm=10.0, grid_mm=PIXEL_MM):
+    shifts_mm = np.zeros((len(plane_mm), 2)) if shifts_mm is None else shifts_mm
+    volume, first_mm = isotropic_labels(
+        probability, PIXEL_MM, plane_mm, shifts_mm, gap_mm, grid_mm, 6.0
+    )
+    heights_mm = first_mm[2] + grid_mm * np.arange(volume.shape[1])
+    return volume[0], heights_mm, first_mm
+
+
+def test_depth_of_a_disc_is_its_radius_less_the_distance_from_its_centre():
+    x, y = in_plane_mm()
+    truth_mm = 20 - np.hypot(x, y)
+
+    depth_mm = plane_depth_mm(
+        np.stack([1 - soft(truth_mm), soft(truth_mm)]).astype(np.float32),
+        PIXEL_MM,
+        np.zeros(2),
+        PIXEL_MM,
+    )
+
+    # The nearest of a lattice of outline points lies at most half a lattice diagonal too far.
+    # At the very centre, averaging the tip of the cone over a pixel adds as much again.
+    near = np.abs(truth_mm) < 15
+    allowed_mm = OUTLINE_MM + PIXEL_MM / REFINE * np.sqrt(2) / 2
+    np.testing.assert_allclose(depth_mm[1][near], truth_mm[near], rtol=0, atol=allowed_mm)
+    np.testing.assert_allclose(depth_mm[0][near], -truth_mm[near], rtol=0, atol=allowed_mm)
+
+
+def test_a_class_that_a_plane_lacks_is_infinitely_far():
+    depth_mm = plane_depth_mm(
+        np.stack([np.ones((8, 8)), np.zeros((8, 8))]).astype(np.float32), 1.5, np.zeros(2), 1.5
+    )
+    assert np.isneginf(depth_mm[1]).all()
+
+
+@pytest.mark.parametrize("grid_mm", [1.0, 1.5, 2.0])
+def test_sphere_has_the_right_radius_at_every_height(grid_mm):
+    """Between planes the radius may miss the circle by the sag of a chord, h^2 / 8 * |r''|."""
+    radius_mm = 27.0
+    plane_mm = np.arange(-30, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    section_mm = np.sqrt(np.maximum(radius_mm**2 - plane_mm**2, 0))
+    depth_mm = section_mm[:, None, None] - np.hypot(x, y)
+
+    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm, grid_mm=grid_mm)
+
+    for height, plane in zip(height_mm, volume, strict=True):
+        # The chord spans heights up to one step further out than this one.
+        outer_mm = abs(height) + STEP_MM
+        if outer_mm > 0.9 * radius_mm:
+            continue
+        r_mm = np.sqrt(radius_mm**2 - outer_mm**2)
+        sag_mm = STEP_MM**2 / 8 * radius_mm**2 / r_mm**3
+        found_mm = np.sqrt(plane.sum() * grid_mm**2 / np.pi)
+        # Counting the lattice points of a disc errs by far less than half a lattice step.
+        tolerance_mm = sag_mm + OUTLINE_MM + grid_mm / 4
+        assert found_mm == pytest.approx(np.sqrt(radius_mm**2 - height**2), abs=tolerance_mm)
+
+
+def test_sphere_ends_within_half_a_plane_step_of_its_poles():
+    radius_mm, plane_mm = 22.0, np.arange(-30, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    section_mm = np.sqrt(np.maximum(radius_mm**2 - plane_mm**2, 0)) - 1e3 * (
+        np.abs(plane_mm) > radius_mm
+    )
+    depth_mm = section_mm[:, None, None] - np.hypot(x, y)
+
+    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm)
+
+    present_mm = height_mm[volume.any(axis=(1, 2))]
+    # Where exactly between the last plane that shows it and the next is not in the data.
+    assert np.abs(present_mm).max() == pytest.approx(radius_mm, abs=STEP_MM)
+
+
+@given(lean=st.floats(-1.0, 1.0), offset_mm=st.floats(-5, 5))
+@settings(max_examples=15, deadline=None)
+def test_slanting_wall_between_two_structures_stays_flat(lean, offset_mm):
+    """Depths of half-spaces are linear in height, so interpolation is exact."""
+    plane_mm = np.arange(0, 30.1, STEP_MM)
+    x, _ = in_plane_mm()
+    depth_mm = x[None] - offset_mm - lean * (plane_mm - 15)[:, None, None]
+    # The distance within a plane is what counts: walls of classes 1 and 2 fill the image.
+    chance = soft(depth_mm)
+    probability = np.stack([0 * chance, chance, 1 - chance], axis=1)[None].astype(np.float32)
+
+    volume, height_mm, first_mm = volume_of(probability, plane_mm)
+
+    inner = (height_mm > plane_mm[0]) & (height_mm < plane_mm[-1])
+    across_mm = first_mm[0] + PIXEL_MM * np.arange(volume.shape[2]) - CENTRE_MM
+    for height, plane in zip(height_mm[inner], volume[inner], strict=True):
+        wall_mm = offset_mm + lean * (height - 15)
+        clear = np.abs(across_mm - wall_mm) > OUTLINE_MM + 0.05
+        expected = np.where(across_mm > wall_mm, 1, 2)[clear]
+        np.testing.assert_array_equal(
+            plane[:, clear], np.broadcast_to(expected, plane[:, clear].shape)
+        )
+
+
+def test_structures_that_end_against_each_other_leave_no_gap():
+    """A ventricle below, an atrium above, same outline: their seam lies half-way, closed."""
+    plane_mm = np.arange(0, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    inside = np.broadcast_to(soft(20 - np.hypot(x, y)), (len(plane_mm), SIDE, SIDE))
+    lower = (np.arange(len(plane_mm)) < 5)[:, None, None]
+    probability = np.stack([1 - inside, inside * lower, inside * ~lower], axis=1)[None]
+
+    volume, height_mm, first_mm = volume_of(probability.astype(np.float32), plane_mm)
+
+    seam_mm = (plane_mm[4] + plane_mm[5]) / 2
+    row, column = (round((CENTRE_MM - first_mm[k]) / PIXEL_MM) for k in (1, 0))
+    core = volume[:, row - 8 : row + 9, column - 8 : column + 9]
+    inner = (height_mm > plane_mm[0]) & (height_mm < plane_mm[-1])
+    below = inner & (height_mm < seam_mm - 0.01)
+    assert (core[below] == 1).all()
+    assert (core[inner & (height_mm > seam_mm + 0.01)] == 2).all()
+    # At the rim background may take a third of the band; nowhere more.
+    reach_mm = np.hypot(
+        *np.meshgrid(
+            *(
+                first_mm[k] + PIXEL_MM * np.arange(n) - CENTRE_MM
+                for k, n in zip((0, 1), volume.shape[:0:-1], strict=True)
+            )
+        )
+    )
+    deep = reach_mm < 20 - BAND_MM / 3 - OUTLINE_MM - PIXEL_MM / 2
+    assert (volume[inner][:, deep] > 0).all()
+
+
+def test_paraboloid_cut_by_the_stack_is_completed_to_its_tip():
+    """The square of its radius is linear along its axis, which is how ends are carried on."""
+    tip_mm, focal = -6.0, 12.0
+    plane_mm = np.arange(0, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    section_mm = np.sqrt(focal * (plane_mm - tip_mm))
+    depth_mm = section_mm[:, None, None] - np.hypot(x, y)
+
+    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm)
+
+    lowest_mm = height_mm[volume.any(axis=(1, 2))].min()
+    # Caps are made plane by plane: the tip lies within one step, the grid adds a voxel.
+    assert lowest_mm == pytest.approx(tip_mm, abs=STEP_MM + PIXEL_MM)
+
+
+def test_what_grows_towards_the_end_stops_before_the_next_slice():
+    plane_mm = np.arange(0, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    depth_mm = (15 + 0.2 * plane_mm)[:, None, None] - np.hypot(x, y)
+
+    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm, gap_mm=10.0)
+
+    present_mm = height_mm[volume.any(axis=(1, 2))]
+    assert plane_mm[-1] < present_mm.max() < plane_mm[-1] + 10
+    assert plane_mm[0] > present_mm.min() > plane_mm[0] - 10
+
+
+def test_shifted_planes_give_the_volume_of_unshifted_ones():
+    """Whole-pixel shifts can be taken back without a trace."""
+    rng = np.random.default_rng(3)
+    plane_mm = np.arange(0, 30.1, STEP_MM)
+    x, y = in_plane_mm()
+    pixels = rng.integers(-3, 4, (len(plane_mm), 2))
+    straight = soft(np.stack([18 - np.hypot(x, y)] * len(plane_mm)))
+    moved = np.stack(
+        [np.roll(p, (s[1], s[0]), axis=(0, 1)) for p, s in zip(straight, pixels, strict=True)]
+    )
+
+    expected, _, _ = volume_of(stack_of(straight), plane_mm)
+    found, _, _ = volume_of(stack_of(moved), plane_mm, pixels * PIXEL_MM)
+
+    # The box follows where the heart was seen, so only sizes and shapes can be compared.
+    np.testing.assert_array_equal(
+        found.reshape(len(found), -1).sum(1), expected.reshape(len(expected), -1).sum(1)
+    )
+
+
+def tilted_heart(shifts_mm, phases=2):
+    """Cone-like bodies about a slanting axis, as labels 1 and 2, displaced slice by slice."""
+    x, y = in_plane_mm()
+    drawn = []
+    for k, (dx, dy) in enumerate(shifts_mm):
+        r = np.hypot(x - (2.0 * k - 10) - dx, y + (1.0 * k - 5) - dy)
+        radius_mm = 10 + k
+        drawn.append(np.where(r < radius_mm, 1, np.where(r < radius_mm + 8, 2, 0)))
+    return np.broadcast_to(np.stack(drawn), (phases, *np.stack(drawn).shape)).astype(np.uint8)
+
+
+def without_trend(shifts_mm):
+    """What is left of shifts when a straight axis, which cannot be told from tilt, is fitted."""
+    k = np.arange(len(shifts_mm))
+    basis = np.stack([np.ones_like(k), k], axis=1).astype(float)
+    return shifts_mm - basis @ np.linalg.lstsq(basis, shifts_mm, rcond=None)[0]
+
+
+def test_breath_hold_jumps_are_found_and_tilt_is_left_alone():
+    axes = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    rng = np.random.default_rng(5)
+    shifts_mm = rng.normal(0, (0.5, 2.0), (10, 2))
+
+    found_mm = slice_shifts_mm(tilted_heart(shifts_mm), PIXEL_MM, 10.0, axes)
+    still_mm = slice_shifts_mm(tilted_heart(0 * shifts_mm), PIXEL_MM, 10.0, axes)
+
+    left_mm = without_trend(found_mm - shifts_mm)
+    # The part that carries no curvature cannot be seen; of the rest at least half must go.
+    assert np.square(left_mm).mean() < 0.25 * np.square(without_trend(shifts_mm)).mean()
+    # A disc's centre on a lattice is known to well under a fifth of a pixel.
+    assert np.abs(still_mm).max() < 0.2 * PIXEL_MM

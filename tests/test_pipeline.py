@@ -1,0 +1,261 @@
+"""The main job from real files on disk: a study goes in, a force field comes out.
+
+The study has few phases so that the tests are quick; nothing else is made easier.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.field import ForceField
+
+PHASES = 8
+
+STUDY_CONFIG = f"mr: {{phases: {PHASES}}}\n"
+
+
+def beatfield(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, as a user starts it."""
+    command = [sys.executable, "-m", "pipeline", *(str(one) for one in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def done(*arguments: object) -> str:
+    """What a command printed; it must have succeeded."""
+    finished = beatfield(*arguments)
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study, and the products of a run over it."""
+    root = tmp_path_factory.mktemp("pipeline")
+    (root / "phantom.yaml").write_text(STUDY_CONFIG)
+    done("synth", root / "studies", "--seed", 5, "--config", root / "phantom.yaml")
+    done("run", root / "studies" / "patient-0001", "--out", root / "out")
+    return root
+
+
+@pytest.fixture(scope="module")
+def products(work: Path) -> Path:
+    return work / "out" / "patient-0001"
+
+
+def metrics_of(products: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((products / "evaluate" / "metrics.json").read_text())
+    return content
+
+
+def test_every_stage_publishes_what_the_design_promises(products: Path) -> None:
+    for name in (
+        "ingest/cine.nii.gz",
+        "ingest/phases.json",
+        "segment/labels_000.nii.gz",
+        f"segment/heart_{PHASES - 1:03d}.nii.gz",
+        "segment/labels.json",
+        "surface/lv_endocardium_000.vtp",
+        f"surface/epicardium_{PHASES - 1:03d}.vtp",
+        "surface/left_atrium_000.vtp",
+        "surface/heart_000.vtp",
+        "register/mr_from_tracker.json",
+        "register/frames.csv",
+        "bake/field.zarr/manifest.json",
+        "bake/field.zarr/zarr.json",
+        "evaluate/metrics.json",
+        "report/index.html",
+    ):
+        assert (products / name).is_file(), name
+    record = json.loads((products / "run.json").read_text())
+    assert [stage["status"] for stage in record["stages"].values()] == ["done"] * 7
+    assert all(stage["seconds"] > 0 for stage in record["stages"].values())
+    assert record["settings"]["bake"]["spacing_mm"] > 0
+
+
+def test_surfaces_are_within_two_millimetres_of_truth_and_closed(products: Path) -> None:
+    structures = metrics_of(products)["structures"]
+    for name in ("lv_endocardium", "epicardium", "left_atrium"):
+        assert len(structures[name]["mean_surface_distance_mm"]) == PHASES
+        assert max(structures[name]["mean_surface_distance_mm"]) < 2.0, name
+    for name, one in structures.items():
+        assert one["closed"], name
+        assert one["one_component"], name
+        assert one["outward"], name
+
+
+def test_registration_ends_within_three_millimetres_from_ten_off(products: Path) -> None:
+    metrics = metrics_of(products)
+    registered = metrics["target_registration_error_mm"]
+    assert registered["start_mean"] > 8.0
+    assert registered["mean"] < 3.0
+    assert metrics["frame_phase_error"]["largest"] < 0.05
+
+
+def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path) -> None:
+    store = products / "bake" / "field.zarr"
+    field = ForceField.open(store)
+    described = json.loads((store / "zarr.json").read_text())["attributes"]["beatfield"]
+    name, fixture = next(iter(described["fixtures"].items()))
+    array = json.loads((store / "distance" / fixture["structure"] / "zarr.json").read_text())
+    shape = tuple(array["shape"])
+    assert len(described["phases"]) == shape[0] == PHASES
+    phase = 3
+    chunk = store / "distance" / fixture["structure"] / "c" / str(phase) / "0" / "0" / "0"
+    stored = np.memmap(chunk, dtype="<f4", mode="r", shape=shape[1:])
+    rng = np.random.default_rng(0)
+    index = np.stack([rng.integers(1, size - 1, 200) for size in shape[1:]], axis=1)
+    points_mm = field.grid.nodes_mm()[tuple(index.T)]
+    at = described["phases"][phase]
+    distance_mm = np.asarray(stored[tuple(index.T)], dtype=float)
+    np.testing.assert_allclose(field.distance_mm(points_mm, at), distance_mm, atol=1e-4)
+
+    # The paper's formula, in NumPy, on what was mapped.
+    delta, m, f_max_n = fixture["delta_mm"], fixture["m"], fixture["f_max_n"]
+    expected = 1 - np.exp(-((distance_mm**2 / (2 * delta**2)) ** m))
+    np.testing.assert_allclose(field.potential(points_mm, at, fixture=name), expected, atol=1e-5)
+    slope = np.stack(np.gradient(np.asarray(stored, dtype=float), *field.grid.spacing_mm), axis=-1)
+    gradient = slope[tuple(index.T)][:, ::-1]
+    length = np.linalg.norm(gradient, axis=1)
+    clear = length > 0.6  # off the medial axis, where the direction is defined
+    unit = np.sign(distance_mm)[:, None] * gradient / length[:, None]
+    force_n = -f_max_n * expected[:, None] * unit
+    found_n = field.force_n(points_mm, at, fixture=name)
+    assert clear.sum() > 100
+    np.testing.assert_allclose(found_n[clear], force_n[clear], atol=1e-3 * f_max_n)
+
+
+def test_query_and_verify_answer_from_the_shell(products: Path) -> None:
+    store = products / "bake" / "field.zarr"
+    record = json.loads((products / "run.json").read_text())
+    example = record["stages"]["bake"]["figures"]["example"]
+    said = done(
+        "query", store, "--json", "--phase", example["phase"], "--point", *example["point_mm"]
+    )
+    answers = json.loads(said)
+    field = ForceField.open(store)
+    for name, answer in answers.items():
+        expected = field.force_n([example["point_mm"]], example["phase"], fixture=name)[0]
+        np.testing.assert_allclose(answer["force_n"], expected)
+    assert len(answers) == 3
+    outside = beatfield("query", store, "--phase", 0, "--point", 999, 0, 0)
+    assert outside.returncode == 2
+    assert "outside the baked grid" in outside.stderr
+    done("verify", store)
+
+
+def test_the_report_needs_no_other_file(products: Path) -> None:
+    page = (products / "report" / "index.html").read_text()
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert sources
+    assert all(source.startswith("data:") for source in sources)
+    for title in ("Segmentation", "Surfaces", "Registration", "Force field", "Against truth"):
+        assert f"<h2>{title}</h2>" in page
+
+
+def test_a_second_run_changes_nothing(work: Path, products: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in products.rglob("*") if path.is_file()}
+    clock = time.perf_counter()
+    said = beatfield("run", work / "studies" / "patient-0001", "--out", work / "out")
+    assert said.returncode == 0
+    assert said.stderr.count("unchanged") == 7
+    assert time.perf_counter() - clock < 30
+    after = {path: path.stat().st_mtime_ns for path in products.rglob("*") if path.is_file()}
+    changed = {path.name for path in after if after[path] != before.get(path)}
+    assert changed <= {"run.json", ".lock"}
+
+
+def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(work: Path, products: Path) -> None:
+    """Killed once on the way: the run after goes on and ends like any other."""
+    settings = work / "nifti.yaml"
+    settings.write_text(STUDY_CONFIG + "cine: nifti\n")
+    made = work / "nifti"
+    done("synth", made, "--seed", 5, "--cine-only", "--config", settings)
+    study = made / "patient-0001"
+    shutil.rmtree(study / "truth")
+    (study / "study.yaml").unlink()
+    command = [sys.executable, "-m", "pipeline", "run", str(study), "--out", str(work / "only")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith("segment"):
+                break
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    found = work / "only" / "patient-0001"
+    assert (found / "ingest" / "cine.nii.gz").exists()
+    assert not (found / "segment").exists()
+
+    said = beatfield("run", study, "--out", work / "only")
+
+    assert said.returncode == 0, said.stderr
+    assert "ingest    unchanged" in said.stderr
+    stages = json.loads((found / "run.json").read_text())["stages"]
+    assert stages["register"]["status"] == stages["evaluate"]["status"] == "skipped"
+    assert ForceField.open(found / "bake" / "field.zarr").mr_from_tracker is None
+    # The same heart as the DICOM study's, so the same bytes from here on.
+    name = "surface/lv_endocardium_003.vtp"
+    assert (found / name).read_bytes() == (products / name).read_bytes()
+
+
+def test_a_users_own_surfaces_bake_the_same_field(work: Path, products: Path) -> None:
+    folder = work / "own"
+    folder.mkdir()
+    for name in ("epicardium", "left_atrium"):
+        for path in sorted((products / "surface").glob(f"{name}_*.vtp")):
+            shutil.copy(path, folder)
+    shutil.copy(products / "ingest" / "phases.json", work)
+    timing = json.loads((work / "phases.json").read_text())
+    (folder / "phases.json").write_text(
+        json.dumps({"phases": timing["phases"], "rr_s": timing["rr_s"]})
+    )
+    done("bake", "--surfaces", folder, "--out", work / "own-out")
+    own = work / "own-out" / "field.zarr"
+    chunk = "distance/epicardium/c/2/0/0/0"
+    assert (own / chunk).read_bytes() == (products / "bake" / "field.zarr" / chunk).read_bytes()
+
+
+def test_a_missing_slice_ends_with_exit_code_2_and_publishes_nothing(work: Path) -> None:
+    study = work / "broken" / "patient-0001"
+    shutil.copytree(work / "studies" / "patient-0001" / "cine", study / "cine")
+    series = sorted(path for path in (study / "cine").iterdir() if path.is_dir())
+    shutil.rmtree(series[5])
+    said = beatfield("run", study, "--out", work / "broken-out")
+    assert said.returncode == 2
+    assert "missing slice" in said.stderr
+    left = sorted(path.name for path in (work / "broken-out" / "patient-0001").iterdir())
+    assert left == [".lock", "run.json"]
+
+
+@pytest.mark.parametrize(
+    ("record", "seconds", "words"),
+    [("mr", 3.0, "shorter than the cine"), ("us", 1.5, "outside the R peaks")],
+)
+def test_an_ecg_that_does_not_cover_the_images_is_refused(
+    work: Path, products: Path, tmp_path: Path, record: str, seconds: float, words: str
+) -> None:
+    """A record as long as its header says, but cut before the images end."""
+    study = tmp_path / "patient-0001"
+    shutil.copytree(work / "studies" / "patient-0001", study)
+    header = study / "ecg" / f"{record}.hea"
+    first, *leads = header.read_text().splitlines()
+    name, count, rate, _ = first.split()[:4]
+    samples = int(seconds * float(rate))
+    header.write_text("\n".join([f"{name} {count} {rate} {samples}", *leads]) + "\n")
+    data = study / "ecg" / f"{record}.dat"
+    data.write_bytes(data.read_bytes()[: samples * int(count) * 2])
+    out = tmp_path / "out"
+    shutil.copytree(products, out / "patient-0001")
+    said = beatfield("run", study, "--out", out, "--until", "register")
+    assert said.returncode == 2
+    assert words in said.stderr

@@ -1,0 +1,150 @@
+"""The model that frames are compared with, and the measure of their agreement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import pyvista as pv
+from ellipsoid_heart import PHASES, moving_surfaces, record, start_off
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
+
+from pipeline.geometry import Float, Grid, Surface, transform_points
+from pipeline.registration.frames import sample_frames
+from pipeline.registration.similarity import agreement
+from pipeline.registration.tissue_map import TissueMap, blurred, coverage, draw_tissue
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return record(seed=1)
+
+
+@pytest.fixture(scope="module")
+def tissue_map():
+    return blurred(draw_tissue(moving_surfaces(), 2.5), 1.5)
+
+
+class TestCoverage:
+    def test_box_with_faces_on_nodes_has_its_exact_volume(self):
+        """Every ray meets an edge or a corner somewhere, and is to cross exactly one triangle."""
+        box = pv.Box((0.0, 10.0, 0.0, 8.0, 0.0, 6.0)).triangulate()
+        triangles = np.asarray(box.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
+        surface = Surface(np.asarray(box.points, float), triangles)
+        grid = Grid((11, 13, 15), (-2.0, -2.0, -2.0), (1.0, 1.0, 1.0))
+
+        share = coverage(surface, grid)
+
+        assert surface.volume_mm3() == pytest.approx(480.0)
+        # Shares are sums of float32 numbers up to 1.
+        assert share.sum(dtype=float) == pytest.approx(480.0, rel=1e-5)
+        assert share[5, 5, 5] == 1
+        assert share[0, 0, 0] == 0
+
+    @given(centre=st.tuples(*[st.floats(-1, 1)] * 3), spacing_mm=st.floats(1.0, 3.0))
+    @settings(max_examples=20)
+    def test_ball_is_full_inside_empty_outside_and_has_its_volume(self, centre, spacing_mm):
+        ball = pv.Icosphere(radius=20.0, center=centre, nsub=4)
+        triangles = np.asarray(ball.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
+        surface = Surface(np.asarray(ball.points, float), triangles)
+        count = int(np.ceil(50 / spacing_mm))
+        grid = Grid((count,) * 3, (-25.0,) * 3, (spacing_mm,) * 3)
+
+        share = coverage(surface, grid)
+
+        distance_mm = np.linalg.norm(grid.nodes_mm() - centre, axis=-1) - 20
+        # A ray through a node leaves its cell by half a cell at most; a flat facet lies up to
+        # 0.1 mm inside the sphere of 20 mm (edges of 3 mm: 3^2 / (8 * 20) = 0.06).
+        assert share[distance_mm > spacing_mm].max() < 1e-6
+        assert share[distance_mm < -spacing_mm - 0.1].min() > 1 - 1e-6
+        # Points of a lattice in a ball: the error grows as the surface's number of nodes to the
+        # power 1/2, each off by less than half a cell.
+        surface_nodes = 4 * np.pi * (20 / spacing_mm) ** 2
+        tolerance = 3 * 0.5 * np.sqrt(surface_nodes) * spacing_mm**3
+        assert abs(share.sum(dtype=float) * spacing_mm**3 - surface.volume_mm3()) < tolerance
+
+
+class TestAgreement:
+    def test_explained_share_is_that_of_a_least_squares_fit(self, tissue_map, recording):
+        """Against a general solver, with the model looked up by a general interpolator."""
+        sweep, pose = recording.sweeps[0], recording.mr_from_tracker
+        samples = sample_frames([sweep], [np.full(len(sweep.images), PHASES[3])], 4.0, 1.5)
+        grid = tissue_map.grid
+        nodes = transform_points(pose, samples.points_mm.astype(float)) - grid.origin_mm
+        nodes = (nodes / grid.spacing_mm).T[::-1]
+        model = [map_coordinates(tissue_map.share[3, ..., k], nodes, order=1) for k in (0, 1)]
+
+        found = agreement(samples, tissue_map, pose).explained
+
+        for frame, (first, last) in enumerate(pairwise(samples.first)):
+            trend = samples.trend[first:last].astype(float)
+            grey = samples.grey[first:last].astype(float)
+            shares = np.column_stack([share[first:last] for share in model])
+            shares -= trend @ np.linalg.lstsq(trend, shares)[0]
+            fit = shares @ np.linalg.lstsq(shares, grey)[0]
+            explained = (fit**2).mean()
+            # The ridge, 1e-3 a sample, holds back at most its share of the weakest direction.
+            weakest = np.linalg.svd(shares, compute_uv=False)[-1] ** 2 / len(grey)
+            held_back = explained * 1e-3 / (weakest + 1e-3)
+            rounding = 1e-4
+            assert explained - held_back - rounding < found[frame] < explained + rounding
+
+    def test_agreement_is_best_at_the_true_pose(self, tissue_map, recording):
+        samples = sample_frames(recording.sweeps, recording.phases, 4.0, 1.5)
+        here = agreement(samples, tissue_map, recording.mr_from_tracker)
+        for seed in range(6):
+            off = start_off(recording, seed, 6, 6)
+            assert agreement(samples, tissue_map, off).score < here.score
+
+    @given(
+        gain=st.floats(0.1, 10),
+        level=st.floats(0, 100),
+        tilt=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.003, 0.003)),
+    )
+    @settings(max_examples=10)
+    def test_gain_level_and_smooth_shading_do_not_matter(
+        self, tissue_map, recording, gain, level, tilt
+    ):
+        sweep = recording.sweeps[0]
+        j, i = np.mgrid[: sweep.images.shape[1], : sweep.images.shape[2]]
+        shading = level + tilt[0] * i + tilt[1] * j + tilt[2] * i * j
+        # Lifted above 0, where a pixel would count as outside the sector.
+        shading -= shading.min() - 1
+        shown = sweep.images > 0
+        changed = replace(sweep, images=np.where(shown, gain * sweep.images + shading, 0))
+
+        before, after = (
+            agreement(
+                sample_frames([one], recording.phases[:1], 4.0, 1.5),
+                tissue_map,
+                recording.mr_from_tracker,
+            ).explained
+            for one in (sweep, changed)
+        )
+
+        # A Gaussian mean over a cut window follows a slope except at the sector's rim, where it
+        # shifts by about one smoothing length: half a grey value a mm, 1.5 mm, against a spread
+        # of some 20 grey values times the least gain.
+        np.testing.assert_allclose(after, before, atol=0.02 + 0.05 / gain)
+
+    def test_last_phase_flows_into_the_first(self, tissue_map, recording):
+        """Half-way between the last stored phase and 1 lies half-way between last and first."""
+        sweep, pose = recording.sweeps[0], recording.mr_from_tracker
+        between = 1 - 0.5 / len(PHASES)
+
+        def explained(phase: float, tissue: TissueMap) -> Float:
+            phases = [np.full(len(sweep.images), phase)]
+            return agreement(sample_frames([sweep], phases, 4.0, 1.5), tissue, pose).explained
+
+        middle = replace(
+            tissue_map,
+            share=tissue_map.share[[-1]] / 2 + tissue_map.share[[0]] / 2,
+            phases=np.array([0.0]),
+        )
+        np.testing.assert_allclose(
+            explained(between, tissue_map), explained(0.0, middle), atol=1e-5
+        )

@@ -1,0 +1,312 @@
+"""The runner: whole products or none, nothing done twice, nothing stale, nothing lost.
+
+The stages here are three small ones of the tests' own; what the runner does with them is what it
+does with the real ones.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from pipeline import run as runner
+from pipeline.config import Settings
+from pipeline.errors import InputError, StageError
+from pipeline.job import Job, Skipped
+from pipeline.publish import PARTIAL, code_digest, only_run_in, publishing
+from pipeline.study import Study, open_study
+
+Body = Callable[[Job], dict[str, Any]]
+
+
+class Silent:
+    """A watcher that only remembers."""
+
+    def __init__(self) -> None:
+        self.outcomes: dict[str, str] = {}
+
+    def started(self, stage: str) -> None: ...
+
+    def progress(self, done: int, total: int) -> None: ...
+
+    def ended(self, stage: str, outcome: str, seconds: float) -> None:
+        self.outcomes[stage] = outcome
+
+
+class Kitchen:
+    """Three stages, a after nothing, b after a, c after a and b, whose bodies can be swapped."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = root / "studies" / "p1"
+        (self.folder / "cine").mkdir(parents=True)
+        (self.folder / "cine" / "image").write_text("first")
+        self.out = root / "out"
+        self.calls: list[str] = []
+        self.bodies: dict[str, Body] = {}
+        stages = (
+            runner.Stage("a", inputs=("cine",)),
+            runner.Stage("b", after=("a",), settings=("bake",)),
+            runner.Stage("c", after=("a", "b")),
+        )
+        monkeypatch.setattr(runner, "STAGES", stages)
+        monkeypatch.setattr(runner, "STAGE_NAMES", tuple(stage.name for stage in stages))
+        for stage in stages:
+            self._register(stage, monkeypatch)
+
+    def _register(self, stage: runner.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+        def run(job: Job) -> dict[str, Any]:
+            self.calls.append(stage.name)
+            if stage.name in self.bodies:
+                return self.bodies[stage.name](job)
+            before = [(job.products / name / "text").read_text() for name in stage.after]
+            before += [(job.study.cine.path / "image").read_text()] if stage.inputs else []
+            (job.folder / "text").write_text(f"{stage.name}({','.join(before)})")
+            return {"figure": 1.5}
+
+        module = ModuleType(f"pipeline.stages.{stage.name}")
+        module.run = run  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+    def study(self) -> Study:
+        return open_study(self.folder)
+
+    def run(self, settings: Settings | None = None, **keys: Any) -> dict[str, str]:
+        """Run; return which stages did what."""
+        self.calls.clear()
+        watcher = Silent()
+        runner.run_study(self.study(), settings or Settings(), self.out, watcher, **keys)
+        return watcher.outcomes
+
+    def text(self, stage: str) -> str:
+        return (self.out / "p1" / stage / "text").read_text()
+
+    def record(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((self.out / "p1" / "run.json").read_text())
+        return content
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kitchen]:
+    return Kitchen(tmp_path, monkeypatch)
+
+
+def test_a_second_run_does_nothing(kitchen: Kitchen) -> None:
+    kitchen.run()
+    assert kitchen.text("c") == "c(a(first),b(a(first)))"
+    first = kitchen.record()
+    assert kitchen.run() == dict.fromkeys("abc", "unchanged")
+    assert kitchen.calls == []
+    assert kitchen.record() == first
+
+
+def test_a_changed_input_runs_all_that_follows_from_it(kitchen: Kitchen) -> None:
+    kitchen.run()
+    (kitchen.folder / "cine" / "image").write_text("other")
+    kitchen.run()
+    assert kitchen.calls == ["a", "b", "c"]
+    assert kitchen.text("c") == "c(a(other),b(a(other)))"
+
+
+def test_a_changed_setting_runs_only_the_stages_that_read_it(kitchen: Kitchen) -> None:
+    kitchen.run()
+    changed = Settings.model_validate({"bake": {"spacing_mm": 3.0}})
+    assert kitchen.run(changed) == {"a": "unchanged", "b": "done", "c": "unchanged"}
+    # b's product came out the same, so c still holds.
+
+
+def test_changed_code_runs_again(kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch) -> None:
+    kitchen.run()
+    monkeypatch.setattr(runner, "code_digest", lambda module: "other code")
+    kitchen.run()
+    assert kitchen.calls == ["a", "b", "c"]
+
+
+def test_a_product_cut_short_is_made_again(kitchen: Kitchen) -> None:
+    kitchen.run()
+    (kitchen.out / "p1" / "b" / "text").write_text("b")
+    kitchen.run()
+    assert kitchen.calls == ["b"]
+
+
+def test_from_runs_a_stage_and_those_after_it(kitchen: Kitchen) -> None:
+    kitchen.run()
+    kitchen.run(first="b")
+    assert kitchen.calls == ["b", "c"]
+
+
+def test_until_ends_the_run_and_marks_later_products_stale(kitchen: Kitchen) -> None:
+    assert list(kitchen.run(last="b")) == ["a", "b"]
+    kitchen.run()
+    (kitchen.folder / "cine" / "image").write_text("other")
+    kitchen.run(last="a")
+    statuses = {name: stage["status"] for name, stage in kitchen.record()["stages"].items()}
+    assert statuses == {"a": "done", "b": "stale", "c": "stale"}
+
+
+def test_a_failing_stage_publishes_nothing_and_keeps_what_was_finished(kitchen: Kitchen) -> None:
+    def fail(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text("half")
+        raise StageError("slice 3: no heart")
+
+    kitchen.bodies["b"] = fail
+    with pytest.raises(StageError, match="slice 3"):
+        kitchen.run()
+    assert sorted(path.name for path in (kitchen.out / "p1").iterdir()) == [
+        ".lock",
+        "a",
+        "run.json",
+    ]
+    record = kitchen.record()
+    assert record["status"] == "failed"
+    assert record["stages"]["b"] == {"status": "failed", "cause": "slice 3: no heart"}
+    kitchen.bodies.clear()
+    kitchen.run()
+    assert kitchen.calls == ["b", "c"]
+
+
+def test_a_failing_stage_leaves_its_earlier_product(kitchen: Kitchen) -> None:
+    kitchen.run()
+    before = kitchen.text("a")
+    (kitchen.folder / "cine" / "image").write_text("other")
+
+    def interrupted(job: Job) -> dict[str, Any]:
+        raise KeyboardInterrupt
+
+    kitchen.bodies["a"] = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        kitchen.run()
+    assert kitchen.text("a") == before
+    assert not list((kitchen.out / "p1").glob(f".*{PARTIAL}*"))
+
+
+def test_a_skipped_stage_says_why_and_removes_what_it_once_made(kitchen: Kitchen) -> None:
+    kitchen.run()
+
+    def skip(job: Job) -> dict[str, Any]:
+        raise Skipped("no ultrasound")
+
+    kitchen.bodies["b"] = skip
+    kitchen.bodies["c"] = lambda job: {"without b": job.product("b") is None}
+    kitchen.run(first="b")
+    assert kitchen.record()["stages"]["b"] == {"status": "skipped", "cause": "no ultrasound"}
+    assert kitchen.record()["stages"]["c"]["figures"] == {"without b": True}
+    assert not (kitchen.out / "p1" / "b").exists()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_named_and_nothing_is_half_written(kitchen: Kitchen, number: int) -> None:
+    def full(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text("half")
+        raise OSError(number, os.strerror(number))
+
+    kitchen.bodies["b"] = full
+    with pytest.raises(InputError, match="disk is full"):
+        kitchen.run()
+    assert not (kitchen.out / "p1" / "b").exists()
+    assert not list((kitchen.out / "p1").glob(f".*{PARTIAL}*"))
+    assert kitchen.text("a") == "a(first)"
+
+
+def test_an_output_folder_that_cannot_be_written(kitchen: Kitchen, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    kitchen.out = tmp_path / "file" / "out"
+    with pytest.raises(InputError, match="cannot be written"):
+        kitchen.run()
+
+
+def test_products_inside_the_study_are_refused(kitchen: Kitchen) -> None:
+    kitchen.out = kitchen.folder
+    with pytest.raises(InputError, match="inside the study"):
+        kitchen.run()
+
+
+def test_two_runs_in_one_folder_are_refused(kitchen: Kitchen) -> None:
+    with only_run_in(kitchen.out / "p1"), pytest.raises(InputError, match="another run"):
+        kitchen.run()
+
+
+def test_killed_while_writing_leaves_the_old_product_and_is_cleared_away(tmp_path: Path) -> None:
+    """kill -9 between the first and the last byte of a product."""
+    target = tmp_path / "stage"
+    with publishing(target) as folder:
+        (folder / "text").write_text("old")
+    script = (
+        "import sys, time; from pathlib import Path; from pipeline.publish import publishing\n"
+        "with publishing(Path(sys.argv[1])) as folder:\n"
+        "    (folder / 'text').write_text('new'); print('writing', flush=True); time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", script, str(target)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "writing\n"
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert (target / "text").read_text() == "old"
+    assert list(tmp_path.glob(f".*{PARTIAL}*"))
+    with only_run_in(tmp_path):
+        assert not list(tmp_path.glob(f".*{PARTIAL}*"))
+
+
+def test_a_real_full_disk_is_noticed_whatever_writes(tmp_path: Path) -> None:
+    """The system refuses files over 100 kB: every writer of products must hear of it."""
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "import numpy as np; from pathlib import Path\n"
+        "from pipeline.geometry import Surface; from pipeline.errors import InputError\n"
+        "from pipeline.imaging.nifti import write_image; from pipeline.meshes import write_vtp\n"
+        "from pipeline.publish import publishing\n"
+        "rng = np.random.default_rng(0); vertices = rng.normal(size=(20000, 3))\n"
+        "def image(f):\n"
+        "    write_image(f / 'i.nii.gz', rng.normal(size=(9, 99, 99)), np.eye(4))\n"
+        "def mesh(f):\n"
+        "    write_vtp(f / 'm.vtp', Surface(vertices, rng.integers(0, 20000, (9000, 3))))\n"
+        "for write in (image, mesh):\n"
+        "    try:\n"
+        "        with publishing(Path(sys.argv[1])) as folder:\n"
+        "            write(folder)\n"
+        "    except InputError as error:\n"
+        "        print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "stage")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.count("the disk is full") == 2, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_code_digest_follows_imports_but_not_those_of_other_stages() -> None:
+    from pipeline.publish import _import_closure
+
+    names = {path.name for path in _import_closure("pipeline.stages.ingest")}
+    assert {"ingest.py", "dicom.py", "nifti.py", "cine.py", "job.py", "errors.py"} <= names
+    assert "fixture.py" not in names
+    assert code_digest("pipeline.stages.ingest") != code_digest("pipeline.stages.surface")
+
+
+def test_peak_memory_is_that_of_the_stretch_and_not_of_the_past() -> None:
+    from pipeline.memory import CLEAR_REFS, PeakMemory
+
+    if not CLEAR_REFS.exists():
+        pytest.skip("only Linux resets its high-water mark")
+    before = PeakMemory().megabytes()
+    large = bytearray(300_000_000)
+    large[::4096] = b"x" * len(large[::4096])
+    grown = PeakMemory()
+    del large
+    time.sleep(0.01)
+    assert grown.megabytes() >= before + 250
+    assert PeakMemory().megabytes() < before + 250

@@ -1,0 +1,243 @@
+"""Labels in, moving surfaces out: names, frames, volumes, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+from surface_shapes import SPACING_MM, MovingBody, ellipsoid, voxel_centres, voxel_noise_mm
+
+from pipeline.errors import InputError, StageError
+from pipeline.evaluation.metrics import closedness, volumes_ml
+from pipeline.geometry import Float, Label, MovingSurface, transform_points
+from pipeline.imaging.labels import LABELS
+from pipeline.surface.extraction import STRUCTURES, extract_moving_surfaces
+from pipeline.surface.settings import SurfaceSettings
+
+PHASES = np.array([0.0, 0.15, 0.35, 0.5, 0.7, 0.85])
+LV = MovingBody(ellipsoid((15, 15, 27)), strain=(0.25, 0.25, 0.1), shift_mm=(0, 0, 4))
+MUSCLE = MovingBody(ellipsoid((22, 22, 34)), strain=(0.1, 0.1, 0.1), shift_mm=(0, 0, 4))
+SETTINGS = SurfaceSettings(edge_mm=2.5)
+
+
+def placed(body: MovingBody, centre: tuple[float, float, float], points: Float, phase: float):
+    return body.inside(points - np.array(centre), phase)
+
+
+def heart_labels() -> tuple[Label, Float]:
+    """A left ventricle, and chambers of other makes beside it; and mr_from_index."""
+    points, first = voxel_centres((60, 40, 52))
+    heart = np.zeros((len(PHASES), *points.shape[:3]), np.uint8)
+    beside = {
+        "rv_cavity": (MovingBody(ellipsoid((18, 20, 26)), (0.2, 0.2, 0.1)), (-33, 0, 0)),
+        "left_atrium": (MovingBody(ellipsoid((12, 12, 12)), (-0.1, -0.1, -0.1)), (15, 12, 26)),
+        "right_atrium": (MovingBody(ellipsoid((13, 13, 13)), (-0.1, -0.1, -0.1)), (-28, 4, 26)),
+    }
+    for volume, phase in zip(heart, PHASES, strict=True):
+        # The muscle comes last and cuts into its neighbours: all chambers touch in all phases.
+        for name, (body, centre) in beside.items():
+            volume[placed(body, centre, points, phase)] = LABELS[name]
+        volume[MUSCLE.inside(points, phase)] = LABELS["lv_myocardium"]
+        volume[LV.inside(points, phase)] = LABELS["lv_cavity"]
+    frame = np.diag([SPACING_MM] * 3 + [1.0])
+    frame[:3, 3] = first
+    return heart, frame
+
+
+HEART, FRAME = heart_labels()
+
+
+@pytest.fixture(scope="module")
+def surfaces() -> dict[str, MovingSurface]:
+    return extract_moving_surfaces(HEART, FRAME, PHASES, SETTINGS)
+
+
+def test_every_structure_that_is_there_gets_a_surface_and_no_other(surfaces):
+    """There is no aorta in these labels."""
+    assert list(surfaces) == [name for name in STRUCTURES if name != "aorta"]
+
+
+def test_surfaces_are_solids_in_every_phase(surfaces):
+    for moving in surfaces.values():
+        assert moving.vertices_mm.shape[0] == len(PHASES)
+        np.testing.assert_array_equal(moving.phases, PHASES)
+        for k in range(len(PHASES)):
+            assert closedness(moving.at(k)).is_solid
+
+
+@pytest.mark.parametrize(("name", "body"), [("lv_endocardium", LV), ("epicardium", MUSCLE)])
+def test_volume_is_kept_to_half_a_percent(surfaces, name, body):
+    """The closed form: 4/3 pi a b c times the determinant of the motion."""
+    axes = (15, 15, 27) if body is LV else (22, 22, 34)
+    rest_ml = 4 / 3 * np.pi * np.prod(axes) / 1000
+    exact = [rest_ml * np.linalg.det(body.motion(phase)[0]) for phase in PHASES]
+    np.testing.assert_allclose(volumes_ml(surfaces[name]), exact, rtol=5e-3)
+
+
+@pytest.mark.parametrize(("name", "body"), [("lv_endocardium", LV), ("epicardium", MUSCLE)])
+def test_vertices_lie_on_the_true_surface_in_patient_millimetres(surfaces, name, body):
+    for vertices, phase in zip(surfaces[name].vertices_mm, PHASES, strict=True):
+        noise_mm = voxel_noise_mm(SPACING_MM, SETTINGS.smoothing_voxels)
+        assert np.abs(body.distance(vertices, phase)).mean() < noise_mm
+
+
+def test_the_heart_encloses_its_chambers(surfaces):
+    """Seams are filled, nothing is taken away: more than the parts, by less than a fifth."""
+    parts = ("epicardium", "rv_endocardium", "left_atrium", "right_atrium")
+    apart = sum(volumes_ml(surfaces[name]) for name in parts)
+    whole = volumes_ml(surfaces["heart"])
+    assert (whole > apart).all()
+    assert (whole < 1.2 * apart).all()
+
+
+def balls(gap_mm: float) -> tuple[Label, Float]:
+    """A left ventricle and a right one, both round, a gap apart in the second of two phases."""
+    points, first = voxel_centres((54, 30, 30))
+    heart = np.zeros((2, *points.shape[:3]), np.uint8)
+    for volume, apart in zip(heart, (0.0, gap_mm), strict=True):
+        far = np.linalg.norm(points - (18, 0, 0), axis=-1)
+        volume[far < 16] = LABELS["lv_myocardium"]
+        volume[far < 10] = LABELS["lv_cavity"]
+        right = np.linalg.norm(points - (18 - 16 - 14 - apart, 0, 0), axis=-1) < 14
+        volume[right] = LABELS["rv_cavity"]
+    frame = np.diag([SPACING_MM] * 3 + [1.0])
+    frame[:3, 3] = first
+    return heart, frame
+
+
+def test_the_heart_bridges_a_gap_that_opens_in_one_phase():
+    """Two faces 4 mm apart are 2 mm from the middle: 8 mm fill 1.4 mm, twice as many 2.8 mm."""
+    heart, frame = balls(4.0)
+    found = extract_moving_surfaces(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+    low, high = found["heart"].vertices_mm[1].min(axis=0), found["heart"].vertices_mm[1].max(axis=0)
+    assert high[0] - low[0] == pytest.approx(2 * 16 + 2 * 14 + 4, abs=SPACING_MM)
+    assert closedness(found["heart"].at(1)).is_solid
+
+
+def test_a_heart_in_pieces_is_refused():
+    heart, frame = balls(15.0)
+    with pytest.raises(StageError, match=r"heart: .*pieces in phase 1 "):
+        extract_moving_surfaces(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+
+
+def one_ventricle(phases: int = 2) -> Label:
+    """A small left ventricle, lopsided so that no mirror image of it is the same."""
+    points, _ = voxel_centres((24, 24, 24))
+    lopsided = points + 0.15 * np.abs(points[..., [1, 2, 0]])
+    inner, outer = (np.linalg.norm(lopsided, axis=-1) < radius for radius in (9, 15))
+    volume = outer * np.uint8(LABELS["lv_myocardium"])
+    volume[inner] = LABELS["lv_cavity"]
+    return np.stack([volume] * phases)
+
+
+VENTRICLE = one_ventricle()
+angles = st.tuples(*[st.floats(-3, 3)] * 3)
+
+
+@settings(max_examples=8)
+@given(angles, angles, st.booleans(), st.floats(0.7, 2.5))
+def test_surfaces_move_with_the_frame_of_the_grid(turn, place, mirrored, spacing_mm):
+    """Oblique or left-handed: vertices are where the frame puts them, and normals point out.
+
+    A spacing scales everything, so the settings in mm are scaled along.
+    """
+    frame = np.eye(4)
+    frame[:3, :3] = spacing_mm * Rotation.from_rotvec(turn).as_matrix()
+    if mirrored:
+        frame[:3, 2] *= -1
+    frame[:3, 3] = 50 * np.array(place)
+    phases = np.array([0.0, 0.5])
+    scaled = SurfaceSettings(edge_mm=2 * spacing_mm, heart_blend_mm=5 * spacing_mm)
+    unit = SurfaceSettings(edge_mm=2.0, heart_blend_mm=5.0)
+
+    found = extract_moving_surfaces(VENTRICLE, frame, phases, scaled)
+
+    plain = extract_moving_surfaces(VENTRICLE, np.eye(4), phases, unit)
+    for name, moving in found.items():
+        expected = transform_points(frame, plain[name].vertices_mm)
+        # Distances are kept in 32 bits, and settings in mm round: 1e-3 voxels.
+        np.testing.assert_allclose(moving.vertices_mm, expected, atol=1e-3 * spacing_mm)
+        assert all(closedness(moving.at(k)).is_solid for k in range(2))
+
+
+def test_a_body_that_touches_the_border_of_the_grid_is_closed():
+    """A ball's half at the border: the flat side closes it, with the volume of the voxels."""
+    cut = VENTRICLE[:, 17:]
+    found = extract_moving_surfaces(cut, FRAME, np.array([0.0, 0.5]), SETTINGS)["epicardium"]
+    assert closedness(found.at(0)).is_solid
+    voxels_ml = np.count_nonzero(cut[0]) * SPACING_MM**3 / 1000
+    assert volumes_ml(found)[0] == pytest.approx(voxels_ml, rel=5e-3)
+
+
+def test_the_same_labels_give_the_same_bytes():
+    phases = np.array([0.0, 0.5])
+    runs = [extract_moving_surfaces(VENTRICLE, FRAME, phases, SETTINGS) for _ in range(2)]
+    for name in runs[0]:
+        assert runs[0][name].vertices_mm.tobytes() == runs[1][name].vertices_mm.tobytes()
+
+
+def test_one_phase_is_enough():
+    found = extract_moving_surfaces(VENTRICLE[:1], FRAME, np.array([0.4]), SETTINGS)
+    assert found["lv_endocardium"].vertices_mm.shape[0] == 1
+
+
+def test_progress_is_told_for_each_structure():
+    calls: list[tuple[int, int]] = []
+    extract_moving_surfaces(
+        VENTRICLE, FRAME, np.array([0.0, 0.5]), SETTINGS, lambda *call: calls.append(call)
+    )
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("label", ["lv_cavity", "lv_myocardium"])
+def test_a_heart_without_left_ventricle_is_refused(label):
+    without = np.where(LABELS[label] == VENTRICLE, np.uint8(0), VENTRICLE)
+    with pytest.raises(StageError, match=f"no {label} in any phase"):
+        extract_moving_surfaces(without, FRAME, np.array([0.0, 0.5]), SETTINGS)
+
+
+def test_a_structure_lost_in_one_phase_is_named_with_the_phase():
+    broken = HEART.copy()
+    broken[3][broken[3] == LABELS["right_atrium"]] = 0
+    with pytest.raises(StageError, match=r"right_atrium: phase 3 \(at 0\.500 of the beat\) has 0"):
+        extract_moving_surfaces(broken, FRAME, PHASES, SETTINGS)
+
+
+def test_specks_of_a_structure_are_no_structure():
+    """A few voxels of aorta in all phases are left out rather than made a surface of."""
+    specked = VENTRICLE.copy()
+    specked[:, 1:3, 1:3, 1:3] = LABELS["aorta"]
+    found = extract_moving_surfaces(specked, FRAME, np.array([0.0, 0.5]), SETTINGS)
+    assert "aorta" not in found
+
+
+SHEARED = FRAME.copy()
+SHEARED[0, 1] = 0.5
+FLAT = np.diag([1.5, 1.5, 8.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("heart", "frame", "phases", "words"),
+    [
+        (VENTRICLE[0], FRAME, [0.0, 0.5], r"must be \(phase, z, y, x\) for 2"),
+        (VENTRICLE, FRAME, [0.0, 0.3, 0.6], r"for 3 phases, got \(2,"),
+        (VENTRICLE, FRAME, [0.5, 0.1], "must rise"),
+        (VENTRICLE, FRAME, [0.5, 1.0], "must rise"),
+        (VENTRICLE, FRAME[:3], [0.0, 0.5], "4x4"),
+        (VENTRICLE, FRAME * np.nan, [0.0, 0.5], "finite"),
+        (VENTRICLE, SHEARED, [0.0, 0.5], "right angles"),
+        (VENTRICLE, FLAT, [0.0, 0.5], "resample"),
+    ],
+)
+def test_input_that_does_not_fit_is_refused(heart, frame, phases, words):
+    with pytest.raises(InputError, match=words):
+        extract_moving_surfaces(heart, frame, np.array(phases), SETTINGS)
+
+
+@pytest.mark.parametrize("bad", [{"edge": 2}, {"edge_mm": 0}, {"reference_phase": 1.0}])
+def test_unknown_or_senseless_settings_fail(bad):
+    with pytest.raises(ValidationError):
+        SurfaceSettings.model_validate(bad)

@@ -1,0 +1,150 @@
+"""Meshes of level sets: closed, outward, even, without folds; and their operators."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_shapes import crossing_triangles, ellipsoid, two_lobes, voxel_centres
+
+from pipeline.errors import StageError
+from pipeline.evaluation.metrics import closedness
+from pipeline.geometry import Surface
+from pipeline.surface.level_set import LevelSet, smooth_level_set
+from pipeline.surface.mesh import (
+    adjacency,
+    bad_triangles,
+    extract_surface,
+    flipped,
+    laplacian,
+    largest_component,
+    triangle_quality,
+    untangled,
+    vertex_areas,
+    vertex_normals,
+)
+
+SHAPES = {
+    "ball": ellipsoid((18, 18, 18)),
+    "ellipsoid": ellipsoid((16, 20, 30)),
+    "thin": ellipsoid((7, 22, 26)),
+    "lobes": two_lobes,
+    "bowl": lambda p: np.maximum(ellipsoid((22, 22, 32))(p), p[..., 2] / 10 - 1),
+}
+
+TETRAHEDRON = Surface(
+    np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+)
+
+
+def level_of(name: str) -> LevelSet:
+    points, _ = voxel_centres((40, 40, 46))
+    return smooth_level_set(SHAPES[name](points) < 0, 1.5, 1.2)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("edge_mm", [2.0, 3.0])
+def test_surface_is_a_solid_of_even_triangles(name, edge_mm):
+    """Euler's number 2 makes it a sphere; a quality of 0.3 is a right triangle of sides 1 : 5."""
+    level = level_of(name)
+    surface = extract_surface(level, edge_mm)
+
+    assert closedness(surface).is_solid
+    assert len(surface.vertices_mm) - len(surface.triangles) / 2 == 2
+    assert crossing_triangles(surface) == 0
+    corners = surface.vertices_mm[surface.triangles]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    # Density of marching cubes varies with direction between 1 and sqrt(3), the edge by its root.
+    assert edges.mean() == pytest.approx(edge_mm, rel=0.15)
+    assert triangle_quality(surface.vertices_mm, surface.triangles).min() > 0.3
+    assert np.abs(level.sample(surface.vertices_mm)[0]).max() < 0.05
+
+
+def test_only_the_largest_piece_is_kept():
+    points, _ = voxel_centres((30, 30, 40))
+    apart = np.minimum(
+        np.linalg.norm(points - (0, 0, 15), axis=-1) - 14,
+        np.linalg.norm(points - (0, 0, -25), axis=-1) - 8,
+    )
+    surface = extract_surface(LevelSet(apart.astype(np.float32), 1.5), 2.0)
+    assert closedness(surface).components == 1
+    assert surface.volume_mm3() == pytest.approx(4 / 3 * np.pi * 14**3, rel=0.02)
+
+
+def test_a_level_set_without_zero_names_the_trouble():
+    with pytest.raises(StageError, match="too small for a surface"):
+        extract_surface(LevelSet(np.ones((9, 9, 9), np.float32), 1.5), 2.0)
+
+
+def test_a_body_that_leaves_the_grid_is_refused():
+    """A plane through the grid cannot be closed."""
+    z = np.indices((12, 12, 12))[0] - 5.3
+    with pytest.raises(StageError, match="open edges"):
+        extract_surface(LevelSet(z.astype(np.float32), 1.5), 2.0)
+
+
+def test_flipping_turns_volume_round():
+    assert flipped(TETRAHEDRON).volume_mm3() == -TETRAHEDRON.volume_mm3()
+    assert TETRAHEDRON.volume_mm3() == pytest.approx(1 / 6)
+
+
+def test_largest_component_renumbers():
+    both = Surface(
+        np.concatenate([TETRAHEDRON.vertices_mm[:3] + 9, TETRAHEDRON.vertices_mm]),
+        np.concatenate([[[0, 1, 2]], TETRAHEDRON.triangles + 3]),
+    )
+    found = largest_component(both)
+    np.testing.assert_array_equal(found.vertices_mm, TETRAHEDRON.vertices_mm)
+    np.testing.assert_array_equal(found.triangles, TETRAHEDRON.triangles)
+
+
+def test_adjacency_and_laplacian_of_a_tetrahedron():
+    """All four are neighbours: ones off the diagonal; the Laplacian kills constants."""
+    np.testing.assert_array_equal(
+        adjacency(TETRAHEDRON.triangles, 4).toarray(), np.ones((4, 4)) - np.eye(4)
+    )
+    stiffness = laplacian(TETRAHEDRON.triangles, 4).toarray()
+    np.testing.assert_allclose(stiffness @ np.ones(4), 0, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.eigvalsh(stiffness), [0, 4 / 6, 4 / 6, 4 / 6], atol=1e-15)
+
+
+def test_areas_and_normals_of_a_tetrahedron():
+    """Three right triangles of area 1/2 and one of sqrt(3)/2; the corner looks along -(1, 1, 1)."""
+    areas = vertex_areas(TETRAHEDRON.vertices_mm, TETRAHEDRON.triangles)
+    assert areas.sum() == pytest.approx(1.5 + np.sqrt(3) / 2)
+    assert areas[0] == pytest.approx(0.5)
+    normals = vertex_normals(TETRAHEDRON.vertices_mm, TETRAHEDRON.triangles)
+    np.testing.assert_allclose(normals[0], -np.ones(3) / np.sqrt(3))
+
+
+def test_quality_is_one_for_equilateral_and_nothing_for_a_line():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, np.sqrt(3) / 2, 0], [2, 0, 0]])
+    found = triangle_quality(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
+    np.testing.assert_allclose(found, [1, 0], atol=1e-15)
+
+
+def test_untangling_mends_a_fold_and_touches_nothing_else():
+    level = level_of("ball")
+    surface = extract_surface(level, 2.0)
+    spoiled = surface.vertices_mm.copy()
+    near = adjacency(surface.triangles, len(spoiled))[[100]].indices
+    # Beyond its ring of neighbours a vertex folds its own triangles over.
+    spoiled[100] += 2.0 * (spoiled[near[0]] - spoiled[100])
+    assert bad_triangles(spoiled, surface.triangles).any()
+
+    mended = untangled(spoiled, surface.triangles, level)
+
+    assert not bad_triangles(mended, surface.triangles).any()
+    assert crossing_triangles(Surface(mended, surface.triangles)) == 0
+    moved = np.linalg.norm(mended - spoiled, axis=1) > 0
+    assert np.count_nonzero(moved) < 100
+    # The step back onto the level is Newton's: what is left is of second order.
+    assert np.abs(level.sample(mended)[0]).max() < 0.1
+
+
+def test_a_sound_mesh_is_not_touched_by_untangling():
+    level = level_of("lobes")
+    surface = extract_surface(level, 2.0)
+    np.testing.assert_array_equal(
+        untangled(surface.vertices_mm, surface.triangles, level), surface.vertices_mm
+    )

@@ -1,0 +1,224 @@
+"""Training of the segmentation network: what it learns from, and that it can be repeated."""
+
+import cv2
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs the extra 'train'")
+pytest.importorskip("onnx", reason="training needs the extra 'train'")
+
+from data_synth.heart import draw_heart  # noqa: E402
+from data_synth.training.__main__ import main  # noqa: E402
+from data_synth.training.contrast import CLASSES, LABEL_OF, draw_contrast  # noqa: E402
+from data_synth.training.export import write_onnx  # noqa: E402
+from data_synth.training.faults import normalise, spoil  # noqa: E402
+from data_synth.training.loop import TrainSettings, draw_batches, train  # noqa: E402
+from data_synth.training.network import PLANES, HeartNet, loss  # noqa: E402
+from data_synth.training.pool import (  # noqa: E402
+    PIXEL_MM,
+    PLANE_STEP_MM,
+    PlaneFrame,
+    PoolSettings,
+    canonical_axes,
+    cut_block,
+    draw_frame,
+    fill_pool,
+    heart_blocks,
+)
+from data_synth.training.render import CROP, draw_sample  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    return heart_blocks(0, PoolSettings())
+
+
+@pytest.fixture(scope="module")
+def heart():
+    return draw_heart(np.random.default_rng(0))
+
+
+def test_blocks_of_a_heart_depend_on_seed_and_number_alone(blocks):
+    np.testing.assert_array_equal(heart_blocks(0, PoolSettings(hearts=7)), blocks)
+    assert (heart_blocks(1, PoolSettings(blocks_per_heart=1))[0] != blocks[0]).any()
+
+
+def test_block_shows_the_tissue_that_the_heart_has_there(heart):
+    frame = PlaneFrame(heart.centre_mm - 40.0, canonical_axes(heart.long_axis), 3.0)
+    block = cut_block(heart, 0.2, frame)
+    index = np.random.default_rng(1).integers(0, block.shape, (200, 3))
+    steps_mm = index[:, ::-1] * (PIXEL_MM, PIXEL_MM, frame.plane_step_mm)
+    points_mm = frame.origin_mm + steps_mm @ frame.axes
+    np.testing.assert_array_equal(block[tuple(index.T)], heart.tissue(points_mm, 0.2))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_drawn_planes_are_canonical_and_of_clinical_spacing(heart, seed):
+    frame = draw_frame(np.random.default_rng(seed), heart)
+    np.testing.assert_allclose(frame.axes @ frame.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame.axes) == pytest.approx(1)
+    assert PLANE_STEP_MM[0] <= frame.plane_step_mm <= PLANE_STEP_MM[1]
+
+
+def test_sample_is_a_normal_image_with_labels_on_three_planes(blocks):
+    rng = np.random.default_rng(2)
+    for _ in range(12):
+        sample = draw_sample(rng, blocks[0])
+        assert sample.image.shape == sample.labels.shape == (PLANES, CROP, CROP)
+        assert sample.image.dtype == np.float32
+        assert np.isfinite(sample.image).all()
+        assert sample.labels.max() < CLASSES
+
+
+def test_samples_show_all_structures_and_no_two_are_alike(blocks):
+    rng = np.random.default_rng(3)
+    samples = [draw_sample(rng, blocks[k % 2]) for k in range(40)]
+    assert set(np.unique([s.labels for s in samples])) == set(range(CLASSES))
+    images = np.stack([s.image for s in samples]).reshape(40, -1)
+    assert len(np.unique(images, axis=0)) == 40
+
+
+def test_same_seed_gives_the_same_batches(blocks):
+    first, second = (
+        next(draw_batches(list(blocks), TrainSettings(batch=2, seed=4))) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+
+
+def test_every_tissue_but_those_named_is_background():
+    assert sorted(LABEL_OF[LABEL_OF > 0]) == [1, 2, 3, 4, 5, 6]
+
+
+def test_contrast_is_never_negative_and_varies():
+    rng = np.random.default_rng(0)
+    drawn = [draw_contrast(rng) for _ in range(200)]
+    assert min(one.mean.min() for one in drawn) >= 0
+    assert np.std([one.muscle for one in drawn]) > 0.1
+
+
+def test_normalised_images_ignore_the_scanner_units():
+    image = np.random.default_rng(0).gamma(2.0, 1.0, (64, 64)).astype(np.float32)
+    # float32 keeps 7 digits; the percentiles' difference is of the order of the values.
+    np.testing.assert_allclose(normalise(image * 700 + 50), normalise(image), atol=1e-4)
+
+
+def test_faults_leave_the_image_recognisable():
+    """Bright stays brighter than dark on the whole, whatever the scanner does."""
+    disc = np.hypot(*np.mgrid[-64:64, -64:64]) < 40
+    for seed in range(20):
+        image = np.broadcast_to(np.where(disc, 1.0, 0.2), (3, 128, 128)).astype(np.float32)
+        spoiled = spoil(np.random.default_rng(seed), image)[1]
+        assert spoiled[disc].mean() > spoiled[~disc].mean()
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_loss_is_cross_entropy_plus_weighted_one_minus_dice(weight):
+    rng = np.random.default_rng(0)
+    scores = rng.normal(size=(2, PLANES * CLASSES, 4, 5))
+    labels = rng.integers(0, CLASSES, (2, PLANES, 4, 5))
+    # The definitions, in plain numpy and double precision.
+    exponent = np.exp(scores.reshape(2, PLANES, CLASSES, 4, 5))
+    chance = np.moveaxis(exponent / exponent.sum(axis=2, keepdims=True), 2, -1)
+    truth = np.eye(CLASSES)[labels]
+    cross_entropy = -np.log((chance * truth).sum(axis=-1)).mean()
+    axes = (0, 1, 2, 3)
+    dice = (2 * (chance * truth).sum(axes) + 1) / (chance.sum(axes) + truth.sum(axes) + 1)
+    expected = cross_entropy + weight * (1 - dice[1:].mean())
+
+    found = float(loss(torch.from_numpy(scores), torch.from_numpy(labels), weight))
+
+    # Sums of under 1000 terms in single precision.
+    assert found == pytest.approx(expected, abs=1e-5)
+
+
+def test_exported_network_computes_what_the_trained_one_does(tmp_path):
+    """Run by an independent engine; batch normalisation folded with statistics far from 0 and 1."""
+    torch.manual_seed(0)
+    network = HeartNet()
+    images = torch.rand(4, 3, 64, 96)
+    network(images)
+    network.eval()
+    write_onnx(tmp_path / "net.onnx", network)
+    engine = cv2.dnn.readNetFromONNX(str(tmp_path / "net.onnx"))
+    engine.setInput(images.numpy(), "images")
+    found = engine.forward("scores")
+
+    with torch.no_grad():
+        expected = network(images).numpy()
+    # Single precision, at most some 20 layers deep with sums of up to 1728 terms.
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_training_repeats_to_the_byte_and_learns(blocks, tmp_path):
+    values = {"a": [], "b": []}
+    settings = TrainSettings(steps=6, batch=2, seed=1)
+    for name in values:
+
+        def note(step, value, minutes, into=values[name]):
+            into.append(value)
+
+        train(list(blocks), settings, tmp_path / name, note)
+    assert values["a"] == values["b"]
+    written = [(tmp_path / name / "heart.onnx").read_bytes() for name in values]
+    assert written[0] == written[1]
+    assert len(written[0]) < 10_000_000
+
+
+def test_training_beats_every_constant_answer(blocks):
+    """A network that sees nothing can at best answer the frequencies of the classes."""
+    torch.manual_seed(0)
+    batches = draw_batches(list(blocks), TrainSettings(batch=2))
+    # With next to no heart in view there is nothing to learn from two images.
+    images, labels = next(b for b in batches if len(np.unique(b[1][..., 32:96, 32:96])) > 5)
+    images, labels = torch.from_numpy(images[..., 32:96, 32:96]), labels[..., 32:96, 32:96]
+    share = np.bincount(labels.ravel(), minlength=CLASSES) / labels.size
+    constant = np.tile(np.log(np.maximum(share, 1e-9)), PLANES)[None, :, None, None]
+    scores = torch.from_numpy(np.broadcast_to(constant, (2, PLANES * CLASSES, 64, 64)).copy())
+    truth = torch.from_numpy(labels)
+    blind = loss(scores, truth, 0.0).item()
+    network = HeartNet()
+    optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3)
+    for _ in range(60):
+        value = loss(network(images), truth, 0.0)
+        optimiser.zero_grad()
+        value.backward()
+        optimiser.step()
+    assert value.item() < blind
+
+
+def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
+    once = TrainSettings(steps=1, batch=2)
+    train(list(blocks), once, tmp_path)
+    still = TrainSettings(steps=1, batch=2, learning_rate=0.0, start=tmp_path / "heart.pt")
+    before = torch.load(tmp_path / "heart.pt", weights_only=True)
+    after = train(list(blocks), still, tmp_path / "on").state_dict()
+    assert torch.equal(before["head.weight"], after["head.weight"])
+
+
+def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
+    import data_synth.training.pool as pool
+
+    made = []
+
+    def quick(number, settings):
+        made.append(number)
+        return np.full((1, 2, 2, 2), number, np.uint8)
+
+    monkeypatch.setattr(pool, "heart_blocks", quick)
+    told = []
+    first = fill_pool(tmp_path, PoolSettings(hearts=2))
+    paths = fill_pool(tmp_path, PoolSettings(hearts=3), lambda *done: told.append(done))
+    assert made == [0, 1, 2]
+    assert paths[:2] == first
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert np.load(paths[2]).max() == 2
+
+
+def test_command_line_leaves_a_network(tmp_path, capsys):
+    arguments = ["--out", str(tmp_path), "--hearts", "1", "--steps", "1", "--batch", "2"]
+    assert main([*arguments, "--pool-only"]) == 0
+    assert not (tmp_path / "heart.onnx").exists()
+    assert main(arguments) == 0
+    assert (tmp_path / "heart.onnx").stat().st_size > 1e6
+    assert "pool: 1 of 1 hearts" in capsys.readouterr().out

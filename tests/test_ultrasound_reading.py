@@ -1,0 +1,208 @@
+"""Sweeps written by SimpleITK itself are read whole, or refused with a reason."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import InputError
+from pipeline.imaging.ultrasound import read_sweep
+
+FRAMES, ROWS, COLUMNS = 5, 12, 17
+PIXELS = np.random.default_rng(0).integers(0, 256, (FRAMES, ROWS, COLUMNS)).astype(np.uint8)
+
+
+def rigid(k):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.1 * k, 0.3, -0.2]).as_matrix()
+    pose[:3, 3] = [100.0 + k, -50.0, 3.0 * k]
+    return pose
+
+
+def calibration(pixel_mm=0.5):
+    matrix = rigid(2)
+    matrix[:3, :3] *= pixel_mm
+    return matrix
+
+
+def text(matrix):
+    return " ".join(f"{value:.17g}" for value in np.asarray(matrix).ravel())
+
+
+def good_fields():
+    fields = {}
+    for k in range(FRAMES):
+        start = f"Seq_Frame{k:04d}_"
+        fields[start + "Timestamp"] = f"{3.0 + 0.05 * k}"
+        fields[start + "ImageStatus"] = "OK"
+        fields[start + "ProbeToTrackerTransform"] = text(rigid(k))
+        fields[start + "ProbeToTrackerTransformStatus"] = "OK"
+        fields[start + "ImageToProbeTransform"] = text(calibration())
+        fields[start + "ImageToProbeTransformStatus"] = "OK"
+    return fields
+
+
+def write(path, fields, pixels=PIXELS, vector=False, compress=False):
+    image = sitk.GetImageFromArray(pixels, isVector=vector)
+    for key, value in fields.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path), useCompression=compress)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "compress"), [("s.mha", False), ("s.mha", True), ("s.mhd", False)]
+)
+def test_frames_times_and_poses_are_read(tmp_path, name, compress):
+    sweep = read_sweep(write(tmp_path / name, good_fields(), compress=compress))
+    np.testing.assert_array_equal(sweep.images, PIXELS)
+    assert sweep.images.dtype == np.float32
+    np.testing.assert_array_equal(sweep.times_s, 3.0 + 0.05 * np.arange(FRAMES))
+    assert (sweep.name, sweep.dropped) == ("s", 0)
+    for k in range(FRAMES):
+        # Column 3, row 7, through the probe into the tracker, one link after the other.
+        probe_mm = calibration() @ [3, 7, 0, 1]
+        tracker_mm = rigid(k) @ probe_mm
+        np.testing.assert_allclose(sweep.tracker_from_image[k] @ [3, 7, 0, 1], tracker_mm)
+
+
+def test_calibration_may_stand_once_for_the_file(tmp_path):
+    fields = {k: v for k, v in good_fields().items() if "ImageToProbe" not in k}
+    fields["ImageToProbeTransform"] = text(calibration())
+    sweep = read_sweep(write(tmp_path / "s.mha", fields))
+    np.testing.assert_allclose(sweep.tracker_from_image[1], rigid(1) @ calibration())
+
+
+@pytest.mark.parametrize(
+    "status", ["ProbeToTrackerTransformStatus", "ImageToProbeTransformStatus", "ImageStatus"]
+)
+def test_invalid_frames_are_left_out_and_counted(tmp_path, status):
+    fields = good_fields()
+    fields[f"Seq_Frame0001_{status}"] = "INVALID"
+    # What a tracker writes while it does not see the marker must not matter.
+    fields["Seq_Frame0001_ProbeToTrackerTransform"] = text(np.full((4, 4), np.nan))
+    fields["Seq_Frame0001_Timestamp"] = "nan"
+    sweep = read_sweep(write(tmp_path / "s.mha", fields))
+    assert sweep.dropped == 1
+    np.testing.assert_array_equal(sweep.images, PIXELS[[0, 2, 3, 4]])
+    np.testing.assert_allclose(sweep.times_s, 3.0 + 0.05 * np.array([0, 2, 3, 4]))
+
+
+def test_sweep_without_a_valid_frame_is_refused(tmp_path):
+    fields = good_fields()
+    for k in range(FRAMES):
+        fields[f"Seq_Frame{k:04d}_ProbeToTrackerTransformStatus"] = "INVALID"
+    with pytest.raises(InputError, match="none of its 5 frames"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"s\.mha: no such file"):
+        read_sweep(tmp_path / "s.mha")
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.98])
+def test_truncated_file_is_refused(tmp_path, kept):
+    path = write(tmp_path / "s.mha", good_fields())
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InputError, match=r"s\.mha"):
+        read_sweep(path)
+
+
+def test_header_without_its_raw_file_is_refused(tmp_path):
+    path = write(tmp_path / "s.mhd", good_fields())
+    path.with_suffix(".raw").unlink()
+    with pytest.raises(InputError, match=r"s\.mhd"):
+        read_sweep(path)
+
+
+def test_file_of_another_kind_is_refused(tmp_path):
+    (tmp_path / "s.mha").write_text("not an image")
+    with pytest.raises(InputError, match="MetaImage"):
+        read_sweep(tmp_path / "s.mha")
+
+
+@pytest.mark.parametrize("name", ["ProbeToTracker", "ImageToProbe"])
+def test_missing_transform_is_named_with_those_that_are_there(tmp_path, name):
+    fields = {k: v for k, v in good_fields().items() if f"{name}Transform" not in k}
+    fields["Seq_Frame0000_StylusToTrackerTransform"] = text(np.eye(4))
+    with pytest.raises(InputError, match=f"frame 0: has no {name}Transform.*StylusToTracker"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("name", ["ProbeToTracker", "ImageToProbe"])
+@pytest.mark.parametrize("value", [text(np.full((4, 4), np.nan)), "1 0 0", "a b c", text([np.inf])])
+def test_transform_that_is_not_16_finite_numbers_is_refused(tmp_path, name, value):
+    fields = good_fields()
+    fields[f"Seq_Frame0003_{name}Transform"] = value
+    with pytest.raises(InputError, match=f"frame 3: {name}Transform needs 16 finite"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("fault", ["scaled", "mirrored", "last row"])
+def test_probe_pose_that_is_not_rigid_is_refused(tmp_path, fault):
+    pose = rigid(2)
+    if fault == "last row":
+        pose[3, 0] = 1.0
+    else:
+        pose[:3, 0] *= {"scaled": 1.01, "mirrored": -1.0}[fault]
+    fields = good_fields()
+    fields["Seq_Frame0002_ProbeToTrackerTransform"] = text(pose)
+    with pytest.raises(InputError, match=r"frame 2: ProbeToTrackerTransform: is not a rotation"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("fault", ["metres", "flat", "last row"])
+def test_calibration_that_is_no_plane_in_mm_is_refused(tmp_path, fault):
+    matrix = calibration(0.0005 if fault == "metres" else 0.5)
+    if fault == "flat":
+        matrix[:3, 1] = matrix[:3, 0]
+    if fault == "last row":
+        matrix[3, 3] = 2.0
+    fields = good_fields() | {"Seq_Frame0000_ImageToProbeTransform": text(matrix)}
+    with pytest.raises(InputError, match="frame 0: ImageToProbeTransform: is no calibration"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("time", ["3.05", "2.0"])
+def test_time_that_does_not_rise_is_refused(tmp_path, time):
+    fields = good_fields() | {"Seq_Frame0002_Timestamp": time}
+    with pytest.raises(InputError, match=r"from frame 1 \(3\.05 s\) to frame 2"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("time", ["", "noon", "inf", None])
+def test_frame_without_a_time_is_refused(tmp_path, time):
+    fields = good_fields()
+    del fields["Seq_Frame0002_Timestamp"]
+    if time is not None:
+        fields["Seq_Frame0002_Timestamp"] = time
+    with pytest.raises(InputError, match="frame 2: Timestamp is"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("frames", [FRAMES - 1, FRAMES + 1])
+def test_wrong_number_of_frames_is_refused(tmp_path, frames):
+    pixels = np.zeros((frames, ROWS, COLUMNS), np.uint8)
+    with pytest.raises(InputError, match=f"holds {frames} images but describes 5 frames"):
+        read_sweep(write(tmp_path / "s.mha", good_fields(), pixels))
+
+
+def test_image_without_frame_fields_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no Seq_Frame fields"):
+        read_sweep(write(tmp_path / "s.mha", {}))
+
+
+@pytest.mark.parametrize("shape", [(ROWS, COLUMNS), (FRAMES, 3, ROWS, COLUMNS)])
+def test_frames_that_are_not_2d_are_refused(tmp_path, shape):
+    with pytest.raises(InputError, match=f"has {len(shape)} dimensions"):
+        read_sweep(write(tmp_path / "s.mha", good_fields(), np.zeros(shape, np.uint8)))
+
+
+def test_colour_frames_are_refused(tmp_path):
+    colour = np.zeros((FRAMES, ROWS, COLUMNS, 3), np.uint8)
+    with pytest.raises(InputError, match="3 values a pixel"):
+        read_sweep(write(tmp_path / "s.mha", good_fields(), colour, vector=True))
