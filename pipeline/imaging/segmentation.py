@@ -25,7 +25,7 @@ from pipeline.imaging.view import PIXEL_MM, View
 
 Progress = Callable[[int, int], None]
 
-LEAST_CUT_MM2 = 60.0
+LEAST_CUT_MM2 = 300.0
 """A slice with less heart than this is judged by the heart's outline over all slices."""
 
 LEAST_SHARE = 0.2
