@@ -25,8 +25,9 @@ from pipeline.imaging.view import PIXEL_MM, View
 
 Progress = Callable[[int, int], None]
 
-LEAST_CUT_MM2 = 300.0
-"""A slice with less heart than this is judged by the heart's outline over all slices."""
+LEAST_CUT = 0.25
+"""A slice with less than this share of the largest cut through the heart is judged by the heart's
+outline over all slices: where a slice grazes the tip, its few pixels are doubtful by nature."""
 
 LEAST_SHARE = 0.2
 """A slice with less than this share of the heart that both its neighbours show has lost it."""
@@ -47,7 +48,7 @@ class Segmentation:
 
     confidence: Float
     """``(phase, z)`` in [0, 1]: mean probability of the labels chosen within the heart; where a
-    slice shows none, within the heart's outline over all slices."""
+    slice shows little of it, within the heart's outline over all slices."""
 
 
 def segment_cine(
@@ -84,16 +85,17 @@ def segment_cine(
 def slice_confidence(found: PlaneProbability, drawn: Label) -> Float:
     """Mean probability of the labels chosen, ``(phase, slice)``, apex first.
 
-    Over a slice's own heart, or, where it shows next to none, over the outline that the heart
-    has in any slice of that phase: a slice beside the heart is understood if it is known as such.
+    Over a slice's own heart, or, where it shows little of it, over the outline that the heart has
+    in any slice of that phase: a slice beside the heart is understood if it is known as such.
     """
     confidence = np.empty(drawn.shape[:2])
     for phase, labels in enumerate(drawn):
         certainty = found.at_slices(phase).max(axis=1)
         outline = (labels > 0).any(axis=0)
+        least = LEAST_CUT * (labels > 0).sum(axis=(1, 2)).max()
         for number, cut in enumerate(labels):
             mask = cut > 0
-            region = mask if mask.sum() * PIXEL_MM**2 >= LEAST_CUT_MM2 else outline
+            region = mask if mask.sum() >= max(least, 1) else outline
             confidence[phase, number] = certainty[number][region].mean() if region.any() else 0.0
     return confidence
 
