@@ -239,7 +239,7 @@ def test_a_missing_slice_ends_with_exit_code_2_and_publishes_nothing(work: Path)
 
 @pytest.mark.parametrize(
     ("record", "seconds", "words"),
-    [("mr", 3.0, "shorter than the cine"), ("us", 1.5, "outside the R peaks")],
+    [("mr", 3.0, "shorter than the cine"), ("us", 3.5, "outside the R peaks")],
 )
 def test_an_ecg_that_does_not_cover_the_images_is_refused(
     work: Path, products: Path, tmp_path: Path, record: str, seconds: float, words: str
