@@ -8,6 +8,9 @@ from scipy import ndimage
 from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.labels import LABELS
 
+NECK = (3, 3)
+"""Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
+
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
 
@@ -62,10 +65,13 @@ def _bounding_box(labels: Label) -> tuple[slice, slice, slice] | None:
 
 
 def _largest_body(mask: Mask) -> Mask:
-    """The largest connected part (faces touching); the mask itself when it is empty."""
-    parts, count = ndimage.label(mask)
+    """The largest part and all that lies within `NECK` of it; the mask itself when empty."""
+    # An auricle's neck may pass between two planes, or be thinner than the pixels.
+    bridged = ndimage.binary_dilation(mask, np.ones((1, *NECK), bool))
+    parts, count = ndimage.label(bridged, np.ones((3, 3, 3), bool))
     if count < 2:
         return mask
+    parts *= mask
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     return np.asarray(parts == sizes.argmax())

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline.errors import StageError
@@ -24,7 +23,6 @@ from pipeline.imaging.network import (
 from pipeline.imaging.view import PIXEL_MM, View, view_of
 
 Progress = Callable[[int, int], None]
-Float16 = npt.NDArray[np.float16]
 
 SURROUNDINGS_MM = 30.0
 """Room left around the heart found at first sight: what it beats into, and what tells it apart."""
@@ -38,9 +36,9 @@ LEAST_FOUND_MM2 = 400.0
 
 @dataclass(frozen=True, slots=True)
 class PlaneProbability:
-    """Class probabilities on parallel planes, half precision, through the cycle."""
+    """Class probabilities on parallel planes through the cycle."""
 
-    value: Float16
+    value: Float32
     """``(phase, plane, class, row, column)``, the plane nearest the apex first."""
 
     view: View
@@ -59,7 +57,7 @@ class PlaneProbability:
     def at_slices(self, phase: int) -> Float32:
         """Probabilities on the slices themselves, ``(slice, class, row, column)``."""
         middle = self.planes_a_slice // 2
-        return np.asarray(self.value[phase, middle :: self.planes_a_slice], np.float32)
+        return self.value[phase, middle :: self.planes_a_slice]
 
 
 def locate_heart(cine: Cine) -> View:
@@ -131,7 +129,7 @@ def label_probability(cine: Cine, view: View, progress: Progress | None = None) 
     keep = slice(None) if step == 1 else slice(PLANES // 2, PLANES // 2 + 1)
     planes = PLANES if step == 1 else 1
     phases, slices = len(cine.intensity), len(view.order)
-    value = np.empty((phases, slices * planes, CLASSES, *view.shape), np.float16)
+    value = np.empty((phases, slices * planes, CLASSES, *view.shape), np.float32)
     for phase in range(phases):
         images = np.stack([normalise(image) for image in _sampled(cine, view, phase)])
         chance = predict(with_neighbours(images, step))[:, keep]
@@ -141,12 +139,13 @@ def label_probability(cine: Cine, view: View, progress: Progress | None = None) 
     return PlaneProbability(value, view, planes)
 
 
-def blend_phases(value: Float16, share: float) -> None:
+def blend_phases(value: Float32, share: float) -> None:
     """Mix each phase with its two neighbours in the cycle, in place."""
-    # Half-precision arithmetic is emulated and slow: all sums are taken in single precision.
-    first, before = value[0].astype(np.float32), value[-1].astype(np.float32)
-    now = first
+    first, before = value[0].copy(), value[-1].copy()
     for phase in range(len(value)):
-        after = first if phase == len(value) - 1 else value[phase + 1].astype(np.float32)
-        value[phase] = (1 - 2 * share) * now + share * (before + after)
-        before, now = now, after
+        now = value[phase].copy()
+        after = first if phase == len(value) - 1 else value[phase + 1]
+        value[phase] *= 1 - 2 * share
+        value[phase] += share * before
+        value[phase] += share * after
+        before = now

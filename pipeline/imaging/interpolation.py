@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.geometry import Float, Float32, Label
-
-Probability = npt.NDArray[np.float16] | npt.NDArray[np.float32]
 
 BAND_MM = 4.0
 """Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
@@ -26,7 +23,7 @@ REFINE = 2
 
 
 def isotropic_labels(
-    probability: Probability,
+    probability: Float32,
     pixel_mm: float,
     plane_mm: Float,
     shifts_mm: Float,
@@ -64,7 +61,7 @@ def isotropic_labels(
     for one in probability[:, :, :, cut[0], cut[1]]:
         depth_mm = np.stack(
             [
-                plane_depth_mm(plane.astype(np.float32), pixel_mm, shift_mm, grid_mm)
+                plane_depth_mm(plane, pixel_mm, shift_mm, grid_mm)
                 for plane, shift_mm in zip(one, shifts_mm, strict=True)
             ]
         )
@@ -76,7 +73,7 @@ def isotropic_labels(
     return np.ascontiguousarray(volume[:, first:last]), first_mm
 
 
-def _cut_around(probability: Probability, margin_mm: float, pixel_mm: float) -> tuple[slice, slice]:
+def _cut_around(probability: Float32, margin_mm: float, pixel_mm: float) -> tuple[slice, slice]:
     """Rows and columns that hold the heart of all phases, and a margin as far as there is one."""
     likely = np.zeros(probability.shape[3:], bool)
     for one in probability:

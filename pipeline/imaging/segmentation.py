@@ -73,7 +73,7 @@ def segment_cine(
     _require_understood(seen, confidence, found.view, settings)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
     for phase, probability in enumerate(found.value):
-        found.value[phase] = clean_probability(probability.astype(np.float32))
+        found.value[phase] = clean_probability(probability)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
     heart, heart_mr_from_index = _isotropic(found, drawn, settings)
