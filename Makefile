@@ -59,7 +59,7 @@ train: setup ## make the segmentation weights anew from the phantom (an hour or 
 	$(BIN)/python -m data_synth.training --out training --steps 6650
 	mkdir -p training/fine && ln -sfn ../pool training/fine/pool
 	$(BIN)/python -m data_synth.training --out training/fine --start training/heart.pt \
-		--learning-rate 1e-3 --overlap-weight 0.2 --steps 2450
+		--learning-rate 1e-3 --overlap-weight 0.2 --steps 2200
 	cp training/fine/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup

@@ -61,8 +61,8 @@ class HeartNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
 def loss(scores: Any, labels: Any, overlap_weight: float = 1.0) -> Any:
     """Cross-entropy plus, weighted, one minus soft Dice of the structures.
 
-    Dice makes small structures count from the first step, but pays for taking a doubtful pixel
-    in, which moves outlines; with cross-entropy alone the more probable class wins.
+    Dice makes small structures count from the first step; cross-entropy alone lets the more
+    probable class win in every pixel.
 
     Parameters
     ----------
