@@ -97,7 +97,8 @@ def run(
     study
         Folder of the study: cine/, and where there are any ecg/, us/, study.yaml.
     from_
-        Run this stage and those after it even if nothing changed.
+        Run this stage and those after it even if nothing changed: ingest, segment, surface,
+        register, bake, evaluate or report.
     until
         End after this stage.
     """
@@ -272,7 +273,13 @@ def _ask(
 
 @app.command
 def verify(field: Path, /) -> int:
-    """Check a baked field: manifest, sizes, checksums, metadata, finite values."""
+    """Check a baked field: manifest, sizes, checksums, metadata, finite values.
+
+    Parameters
+    ----------
+    field
+        The field.zarr folder.
+    """
     from pipeline.field.store import verify_field
 
     print(f"{field}: {verify_field(field)}")
