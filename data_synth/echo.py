@@ -60,6 +60,13 @@ ACOUSTICS: dict[Tissue, Acoustics] = {
     Tissue.AORTA: _BLOOD,
     Tissue.VESSEL_WALL: Acoustics(5.0, 1.80, 1.2),
     Tissue.STOMACH: Acoustics(0.0, 1.40, 4.0),
+    Tissue.PAPILLARY_MUSCLE: _HEART_MUSCLE,
+    Tissue.RV_TRABECULA: _HEART_MUSCLE,
+    Tissue.PERICARDIUM: Acoustics(8.0, 1.85, 1.5),
+    Tissue.GAS: Acoustics(-60.0, 0.10, 40.0),
+    Tissue.SPLEEN: Acoustics(-1.0, 1.66, 1.0),
+    Tissue.LEAFLET: Acoustics(6.0, 1.80, 1.2),
+    Tissue.SCAR: Acoustics(4.0, 1.75, 1.4),
 }
 
 

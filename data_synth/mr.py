@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from data_synth.heart import BeatingHeart
 from data_synth.kernels import Float, Label
-from data_synth.tissue import TRUTH_LABELS, Tissue
+from data_synth.tissue import Tissue, truth_values
 
 Float32 = npt.NDArray[np.float32]
 Int16 = npt.NDArray[np.int16]
@@ -38,6 +38,13 @@ RELAXATION: dict[Tissue, tuple[float, float, float]] = {
     Tissue.AORTA: BLOOD,
     Tissue.VESSEL_WALL: FLESH,
     Tissue.STOMACH: (900.0, 70.0, 0.8),
+    Tissue.PAPILLARY_MUSCLE: (1030.0, 40.0, 0.95),
+    Tissue.RV_TRABECULA: (1030.0, 40.0, 0.95),
+    Tissue.PERICARDIUM: (1000.0, 20.0, 0.4),
+    Tissue.GAS: (1000.0, 40.0, 0.0),
+    Tissue.SPLEEN: (1057.0, 79.0, 0.85),
+    Tissue.LEAFLET: (1000.0, 25.0, 0.6),
+    Tissue.SCAR: (1100.0, 50.0, 0.95),
 }
 """T1 (ms), T2 (ms) and proton density (relative) at 1.5 T.
 
@@ -117,14 +124,6 @@ def steady_state_signal(settings: MrSettings) -> Float:
     below = 1 - (e1 - e2) * math.cos(angle) - e1 * e2
     decay = np.exp(-settings.repetition_ms / 2 / t2)
     return np.asarray(density * math.sin(angle) * (1 - e1) / below * decay)
-
-
-def truth_values() -> Label:
-    """Value in the label files of every tissue, indexed by tissue value."""
-    table = np.zeros(len(Tissue), np.uint8)
-    for value, tissue in TRUTH_LABELS.values():
-        table[tissue] = value
-    return table
 
 
 def plan_stack(rng: np.random.Generator, heart: BeatingHeart, settings: MrSettings) -> Float:

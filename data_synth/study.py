@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from data_synth.dicom import write_dicom
 from data_synth.ecg import EcgSignal, simulate_ecg, write_wfdb
 from data_synth.errors import SynthError
-from data_synth.heart import BeatingHeart, draw_heart
+from data_synth.heart import BeatingHeart
 from data_synth.kernels import Float
 from data_synth.mr import SyntheticCine, acquire_cine, count_slices
+from data_synth.population import draw_heart
 from data_synth.settings import PhantomSettings
 from data_synth.truth import write_json, write_nifti, write_truth
 from data_synth.ultrasound import Sweep, simulate_sweeps, write_sweep

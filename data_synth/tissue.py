@@ -2,6 +2,9 @@
 
 from enum import IntEnum
 
+import numpy as np
+import numpy.typing as npt
+
 
 class Tissue(IntEnum):
     """What a point of the phantom is made of."""
@@ -23,6 +26,13 @@ class Tissue(IntEnum):
     AORTA = 14
     VESSEL_WALL = 15
     STOMACH = 16
+    PAPILLARY_MUSCLE = 17
+    RV_TRABECULA = 18
+    PERICARDIUM = 19
+    GAS = 20
+    SPLEEN = 21
+    LEAFLET = 22
+    SCAR = 23
 
 
 TRUTH_LABELS: dict[str, tuple[int, Tissue]] = {
@@ -34,3 +44,21 @@ TRUTH_LABELS: dict[str, tuple[int, Tissue]] = {
     "aorta": (6, Tissue.AORTA),
 }
 """Name -> (value in label files, tissue); every other tissue is background, 0."""
+
+COUNTED_AS: dict[Tissue, Tissue] = {
+    Tissue.PAPILLARY_MUSCLE: Tissue.LV_CAVITY,
+    Tissue.RV_TRABECULA: Tissue.RV_CAVITY,
+    Tissue.SCAR: Tissue.LV_MYOCARDIUM,
+}
+"""Tissues that readers count to another: papillary muscles and trabeculae lie inside the smooth
+contour of the cavity, as reference ranges are measured (Petersen et al., 2017)."""
+
+
+def truth_values() -> npt.NDArray[np.uint8]:
+    """Value in the label files of every tissue, indexed by tissue value."""
+    table = np.zeros(len(Tissue), np.uint8)
+    for value, tissue in TRUTH_LABELS.values():
+        table[tissue] = value
+    for part, whole in COUNTED_AS.items():
+        table[part] = table[whole]
+    return table

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from data_synth.heart import BeatingHeart, Mesh, enclosed_ml
+from data_synth.heart import BeatingHeart
 from data_synth.kernels import Float
+from data_synth.meshes import Mesh, enclosed_ml
 from data_synth.mr import SyntheticCine
 
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])

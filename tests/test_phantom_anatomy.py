@@ -6,7 +6,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from data_synth.errors import SynthError
-from data_synth.heart import MESH_SPACING_MM, BeatingHeart, draw_heart
+from data_synth.heart import BeatingHeart
+from data_synth.meshes import MESH_SPACING_MM
+from data_synth.population import draw_heart
 from data_synth.tissue import TRUTH_LABELS, Tissue
 
 NAMES = {

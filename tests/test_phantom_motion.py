@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_synth.beat import ATRIUM, TWIST, VENTRICLE, nominal_phase
-from data_synth.heart import BeatingHeart, draw_heart
+from data_synth.heart import BeatingHeart
+from data_synth.population import draw_heart
 from data_synth.tissue import Tissue
 
 PHASES = (0.1, 0.2, 0.36, 0.5, 0.85)

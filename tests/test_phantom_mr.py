@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from data_synth.heart import BeatingHeart, draw_heart
+from data_synth.heart import BeatingHeart
 from data_synth.mr import (
     FULL_SCALE,
     RELAXATION,
@@ -16,6 +16,7 @@ from data_synth.mr import (
     draw_shading,
     steady_state_signal,
 )
+from data_synth.population import draw_heart
 from data_synth.tissue import TRUTH_LABELS, Tissue
 
 CLEAN = MrSettings(

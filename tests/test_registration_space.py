@@ -19,7 +19,7 @@ from ellipsoid_heart import (
 )
 
 from data_synth.ecg import simulate_ecg
-from data_synth.heart import draw_heart
+from data_synth.population import draw_heart
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import MovingSurface

@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from data_synth.heart import draw_heart
 from data_synth.mr import MrSettings, acquire_cine, count_slices
+from data_synth.population import draw_heart
 from data_synth.tissue import TRUTH_LABELS
 from data_synth.training import pool
 from pipeline.errors import InputError, StageError

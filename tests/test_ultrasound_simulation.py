@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from data_synth.ecg import phase_at
 from data_synth.echo import ACOUSTICS, Optics, Sector, bmode
 from data_synth.errors import SynthError
-from data_synth.heart import draw_heart
+from data_synth.population import draw_heart
 from data_synth.tissue import Tissue
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps, write_sweep
 

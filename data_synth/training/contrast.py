@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from data_synth.tissue import TRUTH_LABELS, Tissue
+from data_synth.tissue import COUNTED_AS, TRUTH_LABELS, Tissue, truth_values
 
 Float32 = npt.NDArray[np.float32]
 Label = npt.NDArray[np.uint8]
@@ -20,7 +20,10 @@ Mask = npt.NDArray[np.bool_]
 CLASSES = 1 + len(TRUTH_LABELS)
 
 BLOOD = (Tissue.LV_CAVITY, Tissue.RV_CAVITY, Tissue.LEFT_ATRIUM, Tissue.RIGHT_ATRIUM, Tissue.AORTA)
-WALLS = (Tissue.RV_WALL, Tissue.ATRIAL_WALL, Tissue.VESSEL_WALL)
+WALLS = (
+    *(Tissue.RV_WALL, Tissue.ATRIAL_WALL, Tissue.VESSEL_WALL, Tissue.LEAFLET),
+    *(Tissue.PERICARDIUM, Tissue.SPLEEN),
+)
 
 _BRIGHTNESS: dict[Tissue, tuple[float, float]] = {
     Tissue.AIR: (0.0, 0.03),
@@ -35,6 +38,7 @@ _BRIGHTNESS: dict[Tissue, tuple[float, float]] = {
     Tissue.RIGHT_ATRIUM: (0.65, 1.2),
     Tissue.AORTA: (0.65, 1.3),
     Tissue.STOMACH: (0.02, 1.3),
+    Tissue.GAS: (0.0, 0.1),
 }
 """Least and largest brightness; walls and heart muscle are drawn relative to each other."""
 
@@ -46,10 +50,14 @@ def _table(values: dict[Tissue, int]) -> Label:
     return table
 
 
-LABEL_OF = _table({tissue: value for value, tissue in TRUTH_LABELS.values()})
+LABEL_OF = _table(
+    {tissue: int(value) for tissue, value in zip(Tissue, truth_values(), strict=True)}
+)
 """Label value of every tissue: what the network is to answer."""
 
-IN_HEART = _table(dict.fromkeys((*BLOOD, *WALLS, Tissue.LV_MYOCARDIUM), 1)).astype(bool)
+IN_HEART = _table(dict.fromkeys((*BLOOD, *WALLS[:4], *COUNTED_AS, Tissue.LV_MYOCARDIUM), 1)).astype(
+    bool
+)
 """Whether a tissue belongs to the heart or its great vessels."""
 
 IS_BLOOD = _table(dict.fromkeys(BLOOD, 1)).astype(bool)
@@ -80,6 +88,8 @@ def draw_contrast(rng: np.random.Generator) -> Contrast:
     mean[Tissue.LV_MYOCARDIUM] = muscle
     for tissue in WALLS:
         mean[tissue] = muscle * rng.uniform(0.4, 1.5)
+    for tissue in COUNTED_AS:
+        mean[tissue] = muscle * rng.uniform(0.85, 1.2)
     if rng.random() < 0.5:
         # In many scanners all blood looks alike, and liver like muscle: hardest to tell apart.
         mean[list(BLOOD)] = mean[Tissue.LV_CAVITY] * rng.uniform(0.92, 1.08, len(BLOOD))

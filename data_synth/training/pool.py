@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from data_synth.heart import BeatingHeart, draw_heart
+from data_synth.heart import BeatingHeart
+from data_synth.population import draw_heart
 
 Float = npt.NDArray[np.float64]
 Label = npt.NDArray[np.uint8]
