@@ -15,7 +15,7 @@ from pipeline.errors import InputError
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
 from pipeline.field.certificate import points_about, vtk_distance
-from pipeline.field.kernels import largest_change, largest_steps, node_forces
+from pipeline.field.kernels import largest_change, largest_steps
 from pipeline.field.store import verify_field
 from pipeline.geometry import MovingSurface
 from pipeline.own_surfaces import bake_own_surfaces
@@ -113,21 +113,6 @@ def test_steps_between_nodes_are_plain_differences():
         assert found[1, axis] == pytest.approx(steps[low & high].max(), rel=1e-6)
     changes = np.linalg.norm(force.astype(float) - other, axis=-1)
     assert largest_change(force, other) == pytest.approx(changes.max(), rel=1e-6)
-
-
-def test_forces_at_nodes_are_the_readers(tmp_path):
-    bake_small(tmp_path / "f.zarr")
-    field = ForceField.open(tmp_path / "f.zarr")
-    nodes = field.grid.nodes_mm()
-    for name, law in field.fixtures.items():
-        stored = field.stored_distance_mm(law.structure, 1)
-        found = np.empty((*stored.shape, 3), dtype=np.float32)
-        law_numbers = (law.side_code, law.resolved_delta_mm, law.m, law.f_max_n)
-        node_forces(stored, np.array(field.grid.spacing_mm), *law_numbers, found)
-
-        expected = field.force_n(nodes.reshape(-1, 3), PHASES[1], name).reshape(found.shape)
-
-        np.testing.assert_allclose(found, expected, rtol=0, atol=2 * 2.0**-23)
 
 
 def test_only_what_is_needed_is_baked(tmp_path):
@@ -240,11 +225,12 @@ def test_surfaces_of_ones_own(folder, tmp_path):
 
     np.testing.assert_allclose(field.phases, [0, 1 / 3, 2 / 3])
     assert field.structures == ("box",)
-    # Two voxels and more from any edge the distance of a flat wall is linear: nothing to
-    # interpolate wrongly.
+    # Far from edges the distance of a flat wall is linear: nothing to interpolate wrongly. The
+    # spline feels the kink in the middle of the box, n = 4 nodes of 4 mm away, where the slope
+    # turns by 2, by less than 2 * 4 mm * (3 - sqrt 8)^n.
     for number in range(3):
         found = field.distance_mm([[20.0 + number, 0, 0]], number / 3)
-        assert found[0] == pytest.approx(1.0, abs=1e-6)
+        assert found[0] == pytest.approx(1.0, abs=8 * (3 - math.sqrt(8)) ** 4)
     assert "own_surfaces" not in field.source
     assert set(field.source["surfaces"]) == {
         "box_000.vtp",
@@ -274,7 +260,8 @@ def test_a_single_file_is_a_surface_at_rest(tmp_path):
     field = ForceField.open(bake_own_surfaces(tmp_path / "own", tmp_path / "out", own_settings()))
 
     still = field.force_n(np.tile([[12.0, 1, 1]], (3, 1)), [0.0, 0.4, 0.9])
-    assert np.ptp(still, axis=0).max() == 0
+    # Weights in time sum to 1 but for rounding.
+    assert np.ptp(still, axis=0).max() < 1e-15
     assert field.accuracy["force_change_max_n"] == 0
 
 

@@ -6,13 +6,15 @@ import sys
 
 import numpy as np
 import pytest
-from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, TRACKER, bake_small
-from field_shapes import sag, sphere
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, TRACKER, bake_small
+from field_shapes import beating, sag, sphere
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from pipeline.errors import InputError
-from pipeline.field import ForceField
+from pipeline.field import Fixture, ForceField
+from pipeline.field.bake import bake_field
 from pipeline.field.potential import direction_scale, offence, potential, pull
 from pipeline.field.query import query_point
 from pipeline.geometry import Float
@@ -70,49 +72,71 @@ def test_chunk_files_are_the_field(path, field):
         chunk = path / "distance" / "ball" / "c" / str(k) / "0" / "0" / "0"
         raw = np.memmap(chunk, dtype="<f4", mode="r").astype(float)
 
-        # Interpolation at a node is that node's value but for rounding of its place, 1e-14 mm.
-        np.testing.assert_allclose(field.distance_mm(nodes, phase), raw, rtol=0, atol=1e-11)
+        # The spline takes the node's value but for coefficients rounded to float32.
+        rounding_mm = 4 * 2.0**-24 * np.abs(raw).max()
+        np.testing.assert_allclose(field.distance_mm(nodes, phase), raw, rtol=0, atol=rounding_mm)
 
-        height = potential(np.abs(raw), FIXTURES["guide"].resolved_delta_mm, 2)
-        np.testing.assert_allclose(field.potential(nodes, phase), height, rtol=0, atol=1e-11)
+        law = FIXTURES["guide"]
+        height = potential(np.abs(raw), law.resolved_delta_mm, law.m)
+        steepest = law.stiffness_n_per_m / 1000 / law.f_max_n
+        np.testing.assert_allclose(
+            field.potential(nodes, phase), height, rtol=0, atol=steepest * rounding_mm
+        )
         stored = np.memmap(path / "potential/guide/c" / str(k) / "0/0/0", dtype="<f4", mode="r")
         np.testing.assert_allclose(stored, height, rtol=0, atol=2**-24)
 
 
-def test_force_is_the_formula_on_plain_numpy(path, field):
-    """The paper's formula with np.gradient, at all nodes within the grid."""
-    k, law = 2, FIXTURES["guide"]
-    shape = field.grid.shape
-    chunk = path / "distance" / "ball" / "c" / str(k) / "0" / "0" / "0"
-    distance = np.memmap(chunk, dtype="<f4", mode="r", shape=shape).astype(float)
-    gradient = np.stack(np.gradient(distance, 3.0)[::-1], axis=-1)
-    length = np.linalg.norm(gradient, axis=-1, keepdims=True)
-    height = 1 - np.exp(-((distance**2 / (2 * law.resolved_delta_mm**2)) ** law.m))
-    down = -np.sign(distance)[..., None] * gradient / np.maximum(length, 0.5)
-    expected = law.f_max_n * height[..., None] * down
+@pytest.mark.parametrize("k", range(len(PHASES)))
+def test_space_is_the_quadratic_spline_of_scipy(field, k):
+    """An independent spline through the stored distances of one phase."""
+    stored = field.stored_distance_mm("ball", k).astype(float)
+    asked = random_points(400)[np.abs(random_points(400)).max(axis=1) < 12]
+    places = ((asked - field.grid.origin_mm) / 3.0).T[::-1]
 
-    found = field.force_n(field.grid.nodes_mm().reshape(-1, 3), PHASES[k])
+    expected = map_coordinates(stored, places, order=2, mode="mirror")
 
-    np.testing.assert_allclose(found.reshape(*shape, 3), expected, rtol=0, atol=1e-11)
+    # SciPy mirrors at the boundary, at least 7 nodes away: (3 - sqrt 8)^7 of a slope of 1, 3 mm.
+    np.testing.assert_allclose(
+        field.distance_mm(asked, PHASES[k]), expected, rtol=0, atol=3 * (3 - 8**0.5) ** 7
+    )
 
 
-@pytest.mark.parametrize("phase", [*PHASES, 0.33, 0.9, 0.0, 0.02])
-def test_distance_is_that_of_the_ball(field, phase):
-    """Truth: a ball whose radius changes linearly between the phases, the cycle closed."""
-    radius = np.interp(phase, [*(PHASES - 1), *PHASES, *(PHASES + 1)], np.tile(RADII_MM, 3))
+@pytest.mark.parametrize(("k", "phase"), list(enumerate(PHASES)))
+def test_distance_is_that_of_the_ball(field, k, phase):
     asked = random_points(500)
-    exact = np.linalg.norm(asked, axis=1) - radius
+    r = np.linalg.norm(asked, axis=1)
 
-    error = np.abs(field.distance_mm(asked, phase) - exact)
+    error = np.abs(field.distance_mm(asked, phase) - (r - RADII_MM[k]))
 
     # Linear interpolation errs by at most h^2 / 8 times the sum of the second derivatives, 2 / r
-    # for the distance from a point r away; the cubic one is better wherever that is small.
-    r = np.linalg.norm(asked, axis=1)
+    # for the distance from a point r away; the spline is better wherever that is small.
     clear = r > 9
     bound = 3.0**2 / 8 * 2 / (r[clear] - 3) + sag(sphere(20, 3), 20)
     assert (error[clear] <= bound).all()
-    # A quarter of the time between two phases moves this surface by less than it errs by.
     assert np.median(error) < 0.1
+
+
+@pytest.mark.parametrize("count", [3, 8, 25])
+def test_between_phases_the_error_falls_with_the_third_power_of_the_step(tmp_path, count):
+    """Truth: a radius that swings as a cosine, 3 mm up and down, asked at any moment."""
+    phases = (np.arange(count) + 0.3) / count
+    swing = beating(sphere(1.0, 3), 20 + 3 * np.cos(2 * np.pi * phases), phases)
+    fixture = Fixture(structure="ball", kind="guidance", delta_mm=8.0, f_max_n=1.0)
+    bake_field(tmp_path / "f.zarr", {"ball": swing}, {"hold": fixture}, SETTINGS, rr_s=0.8)
+    field = ForceField.open(tmp_path / "f.zarr")
+    moments = np.linspace(0, 1, 301)
+    corner = sphere(1.0, 3).vertices_mm[7]
+
+    found = field.distance_mm(np.tile(20 * corner, (301, 1)), moments)
+
+    # On this ray every distance is the radius's change plus what one place in space is off by.
+    still = field.distance_mm([20 * corner], phases[0])[0] + 3 * np.cos(2 * np.pi * phases[0])
+    error = np.abs(found - (still - 3 * np.cos(2 * np.pi * moments)))
+    # The spline that interpolates between its knots errs by at most h^3 / 24 of the third
+    # derivative (twice the bound of de Boor, A Practical Guide to Splines, ch. 6, for equal
+    # steps); the place in space errs by h^2 / 8 * 2 / r more or less as the ball moves 3 mm.
+    in_space = 3.0**2 / 8 * 2 * 6 / 17**2
+    assert error.max() <= 3 * (2 * np.pi / count) ** 3 / 24 + in_space
 
 
 @given(points, phases)

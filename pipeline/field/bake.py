@@ -28,6 +28,7 @@ from pipeline.field.metadata import (
 )
 from pipeline.field.potential import offence, potential
 from pipeline.field.reader import ForceField
+from pipeline.field.spline import space_coefficients
 from pipeline.field.store import FieldWriter
 from pipeline.geometry import Float, Float32, Grid, Surface, require_rigid
 
@@ -120,6 +121,7 @@ def bake_field(
         for name, values in _arrays(index, chosen, fixtures, grid):
             writer.write(name, index, values)
         count.step()
+    writer.solve_splines_in_time()
     accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
     writer.finish(metadata.model_copy(update={"accuracy": accuracy}))
     return accuracy
@@ -142,6 +144,10 @@ def _arrays(
     for structure, moving in surfaces.items():
         distance_mm = distance_of_closed(moving.at(index), grid)
         yield f"distance/{structure}", distance_mm
+        yield (
+            f"spline/{structure}",
+            space_coefficients(distance_mm.astype(np.float64)).astype(np.float32),
+        )
         for name, fixture in fixtures.items():
             if fixture.structure == structure:
                 yield f"potential/{name}", potential_grid(distance_mm, fixture)
@@ -220,6 +226,7 @@ def _describe(name: str, moving: BeatingSurface) -> StructurePart:
         require_outward(surface, where)
     return StructurePart(
         path=f"distance/{name}",
+        spline=f"spline/{name}",
         triangles=[len(surface.triangles) for surface in each],
         volume_ml=[surface.volume_mm3() / 1000 for surface in each],
     )

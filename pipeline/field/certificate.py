@@ -13,9 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from pipeline.field.distance import processors
-from pipeline.field.fixture import Fixture
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, Float32, Surface
+from pipeline.geometry import Float, Surface
 
 BAND_MM = 15.0
 """How far from the surface the interpolated distance is checked."""
@@ -59,7 +58,7 @@ def certify(
     Largest errors over all, and per structure and fixture.
     """
     distances: dict[str, list[dict[str, Any]]] = {name: [] for name in volume.structures}
-    forces = {name: _ForceSteps(volume, fixture) for name, fixture in volume.fixtures.items()}
+    forces = {name: _ForceSteps(volume, name) for name in volume.fixtures}
     with ThreadPoolExecutor(processors()) as pool:
         for index in range(len(volume.phases)):
             steps = [pool.submit(one.add, index) for one in forces.values()]
@@ -171,12 +170,13 @@ def _over_fixtures(fixtures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 class _ForceSteps:
     """Largest steps of one fixture's force, gathered phase by phase in their order."""
 
-    def __init__(self, volume: ForceField, fixture: Fixture) -> None:
+    def __init__(self, volume: ForceField, name: str) -> None:
         self._volume = volume
-        self._fixture = fixture
+        self._name = name
+        self._fixture = fixture = volume.fixtures[name]
         self._near_mm = 2 * fixture.resolved_delta_mm
-        self._first_n: Float32 | None = None
-        self._before_n: Float32 | None = None
+        self._first_n: Float | None = None
+        self._before_n: Float | None = None
         self._steps_n = np.zeros((2, 3))
         self._changes_n: list[float] = []
 
@@ -194,16 +194,11 @@ class _ForceSteps:
         self._first_n = force_n if self._first_n is None else self._first_n
         self._before_n = force_n
 
-    def _forces(self, index: int) -> Float32:
-        from pipeline.field.kernels import node_forces
-
-        fixture = self._fixture
-        stored = self._volume.stored_distance_mm(fixture.structure, index)
-        force_n = np.empty((*stored.shape, 3), dtype=np.float32)
-        spacing_mm = np.array(self._volume.grid.spacing_mm)
-        law = (fixture.side_code, fixture.resolved_delta_mm, fixture.m, fixture.f_max_n)
-        node_forces(stored, spacing_mm, *law, force_n)
-        return force_n
+    def _forces(self, index: int) -> Float:
+        grid = self._volume.grid
+        nodes_mm = grid.nodes_mm().reshape(-1, 3)
+        phase = self._volume.phases[index]
+        return self._volume.force_n(nodes_mm, phase, self._name).reshape(*grid.shape, 3)
 
     def result(self) -> dict[str, Any]:
         """The largest steps over space and, the cycle closed, over time."""

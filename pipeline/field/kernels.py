@@ -1,4 +1,4 @@
-"""Compiled kernels: interpolation of the baked distance, and forces on all nodes.
+"""Compiled kernels: the spline through the baked distance, its gradient, potential and force.
 
 Importing this module imports numba; only functions that need it do so. The kernels release the
 interpreter lock, so callers split work over threads.
@@ -6,9 +6,11 @@ interpreter lock, so callers split work over threads.
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-from numba.extending import register_jitable
+import math
+from typing import Any
+
+from numba import njit, types
+from numba.extending import intrinsic, register_jitable
 
 from pipeline.field import potential as formulas
 
@@ -19,122 +21,180 @@ _pull = formulas.pull
 _direction_scale = formulas.direction_scale
 
 
-@njit(nogil=True, cache=True)
-def _axis_weights(place, count, first, weights, slopes):  # type: ignore[no-untyped-def]
-    """Catmull-Rom weights of four neighbours on one axis, and their slopes per node step.
+CONTRACT = {"contract"}
+"""A product and a sum may be rounded once instead of twice; nothing else is relaxed."""
 
-    Beyond the grid's end the distance goes on in a straight line (one ghost node), which is
-    folded into the weights of the two last nodes; so every index stays inside the grid.
+
+@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
+def _value(typing_context: Any, address: Any, index: Any) -> Any:
+    """The float32 number ``index`` after an address, as float64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        single = context.get_value_type(types.float32)
+        start = builder.inttoptr(arguments[0], single.as_pointer())
+        value = builder.load(builder.gep(start, [arguments[1]]))
+        return builder.fpext(value, context.get_value_type(types.float64))
+
+    return types.float64(types.uintp, types.intp), generate
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
+def _three(place, count):  # type: ignore[no-untyped-def]
+    """Three neighbours of a place on one axis, their weights, and their slopes per step.
+
+    Beyond the grid's end the coefficients go on in a straight line; the ghost is folded into
+    the weights of the two last, so every index stays inside the grid.
     """
     place = min(max(place, 0.0), count - 1.0)
-    cell = min(int(place), count - 2)
-    t = place - cell
-    weights[0] = ((2.0 - t) * t - 1.0) * t * 0.5
-    weights[1] = ((3.0 * t - 5.0) * t * t + 2.0) * 0.5
-    weights[2] = ((4.0 - 3.0 * t) * t + 1.0) * t * 0.5
-    weights[3] = (t - 1.0) * t * t * 0.5
-    slopes[0] = ((4.0 - 3.0 * t) * t - 1.0) * 0.5
-    slopes[1] = (9.0 * t - 10.0) * t * 0.5
-    slopes[2] = ((8.0 - 9.0 * t) * t + 1.0) * 0.5
-    slopes[3] = (3.0 * t - 2.0) * t * 0.5
-    for k in range(4):
-        first[k] = cell - 1 + k
-    if cell == 0:
-        _fold(weights, 0, 1, 2)
-        _fold(slopes, 0, 1, 2)
-        first[0] = 0
-    if cell == count - 2:
-        _fold(weights, 3, 2, 1)
-        _fold(slopes, 3, 2, 1)
-        first[3] = count - 1
+    middle = int(place + 0.5)
+    t = place - middle
+    w0, w1, w2 = 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
+    s0, s1, s2 = t - 0.5, -2.0 * t, t + 0.5
+    i0, i2 = middle - 1, middle + 1
+    if i0 < 0:
+        w1, w2, w0, s1, s2, s0 = w1 + 2 * w0, w2 - w0, 0.0, s1 + 2 * s0, s2 - s0, 0.0
+        i0 = 0
+    if i2 >= count:
+        w1, w0, w2, s1, s0, s2 = w1 + 2 * w2, w0 - w2, 0.0, s1 + 2 * s2, s0 - s2, 0.0
+        i2 = middle
+    return i0, middle, i2, w0, w1, w2, s0, s1, s2
 
 
-@njit(nogil=True, cache=True)
-def _fold(values, ghost, end, before):  # type: ignore[no-untyped-def]
-    values[end] += 2.0 * values[ghost]
-    values[before] -= values[ghost]
-    values[ghost] = 0.0
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _moment(line, phase):  # type: ignore[no-untyped-def]
+    """Interval of a phase in ``spline.timeline``, and the weights of its three phases."""
+    first = line[0, 0]
+    turned = phase - math.floor(phase - first)
+    if turned >= first + 1.0:
+        turned -= 1.0
+    low, high = 0, len(line)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if line[middle, 0] <= turned:
+            low = middle
+        else:
+            high = middle
+    late, early = turned - line[low, 0], line[low, 1] - turned
+    before, after = early * early * line[low, 2], late * late * line[low, 3]
+    return low, before, 1.0 - before - after, after
 
 
-@njit(nogil=True, cache=True)
-def interpolate(before, after, shares, origin_mm, spacing_mm, points_mm, distance_mm, gradient):  # type: ignore[no-untyped-def]
-    """Distance and its gradient at points, between two stored phases.
+@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
+def _row(p0, p1, p2, t0, t1, t2, start, i0, i1, i2, w0, w1, w2, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """One row of nodes along x at one moment: its value, and its slope along x."""
+    a = t0 * _value(p0, start + i0) + t1 * _value(p1, start + i0) + t2 * _value(p2, start + i0)
+    b = t0 * _value(p0, start + i1) + t1 * _value(p1, start + i1) + t2 * _value(p2, start + i1)
+    c = t0 * _value(p0, start + i2) + t1 * _value(p1, start + i2) + t2 * _value(p2, start + i2)
+    return w0 * a + w1 * b + w2 * c, s0 * a + s1 * b + s2 * c
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
+def _plane(p0, p1, p2, t0, t1, t2, start, width, xs, ys):  # type: ignore[no-untyped-def]
+    """One plane of nine nodes: value, and slopes along x and y."""
+    i0, i1, i2, w0, w1, w2, s0, s1, s2 = xs
+    j0, j1, j2, u0, u1, u2, r0, r1, r2 = ys
+    a, ax = _row(p0, p1, p2, t0, t1, t2, start + j0 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
+    b, bx = _row(p0, p1, p2, t0, t1, t2, start + j1 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
+    c, cx = _row(p0, p1, p2, t0, t1, t2, start + j2 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
+    return (
+        u0 * a + u1 * b + u2 * c,
+        u0 * ax + u1 * bx + u2 * cx,
+        r0 * a + r1 * b + r2 * c,
+    )
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Distance and gradient at one point; see ``sample``."""
+    count_x, count_y, count_z = int(grid[6]), int(grid[7]), int(grid[8])
+    k, t0, t1, t2 = _moment(line, phase)
+    phases = len(addresses)
+    p0 = addresses[k - 1 if k > 0 else phases - 1]
+    p1 = addresses[k]
+    p2 = addresses[k + 1 if k + 1 < phases else 0]
+    xs = _three((x_mm - grid[0]) / grid[3], count_x)
+    ys = _three((y_mm - grid[1]) / grid[4], count_y)
+    k0, k1, k2, v0, v1, v2, q0, q1, q2 = _three((z_mm - grid[2]) / grid[5], count_z)
+    layer = count_x * count_y
+    a, ax, ay = _plane(p0, p1, p2, t0, t1, t2, k0 * layer, count_x, xs, ys)
+    b, bx, by = _plane(p0, p1, p2, t0, t1, t2, k1 * layer, count_x, xs, ys)
+    c, cx, cy = _plane(p0, p1, p2, t0, t1, t2, k2 * layer, count_x, xs, ys)
+    return (
+        v0 * a + v1 * b + v2 * c,
+        (v0 * ax + v1 * bx + v2 * cx) / grid[3],
+        (v0 * ay + v1 * by + v2 * cy) / grid[4],
+        (q0 * a + q1 * b + q2 * c) / grid[5],
+    )
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Distance and gradient at one point: four numbers, none where the question has none.
+
+    The arguments are those of ``sample``.
+    """
+    if not math.isfinite(x_mm + y_mm + z_mm + phase):
+        return math.nan, math.nan, math.nan, math.nan
+    return _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    distance_mm, gx, gy, gz = _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
+    size = _pull(distance_mm, side, delta_mm, m)
+    scale = -f_max_n * size * _direction_scale(math.sqrt(gx * gx + gy * gy + gz * gz))
+    return scale * gx, scale * gy, scale * gz
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Force at one point: three newtons, none where the question has a number that is none."""
+    if not math.isfinite(x_mm + y_mm + z_mm + phase):
+        return math.nan, math.nan, math.nan
+    return _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase)
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # type: ignore[no-untyped-def]
+    """Distance and its gradient at points.
 
     Parameters
     ----------
-    before, after
-        ``(z, y, x)`` distances of the two phases, mm.
-    shares
-        ``(n,)`` weight of ``after`` for every point.
-    origin_mm, spacing_mm
-        Of the grid, ``(x, y, z)``.
+    addresses
+        ``(phase,)`` where in memory the float32 ``(z, y, x)`` coefficients of each phase are.
+    line
+        ``spline.timeline`` of the phases.
+    grid
+        Origin, spacing and node counts, each ``x, y, z``: nine numbers.
     points_mm
         ``(n, 3)``; those outside the grid are moved to its boundary.
+    phases
+        ``(n,)``, or ``(1,)`` for all.
     distance_mm, gradient
         Where the ``(n,)`` distances and ``(n, 3)`` gradients go.
     """
-    index = np.empty((3, 4), dtype=np.int64)
-    weights, slopes = np.empty((3, 4)), np.empty((3, 4))
-    for number in range(len(points_mm)):
-        for axis in range(3):
-            place = (points_mm[number, axis] - origin_mm[axis]) / spacing_mm[axis]
-            _axis_weights(place, before.shape[2 - axis], index[axis], weights[axis], slopes[axis])
-        late = shares[number]
-        early = 1.0 - late
-        value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
-        for c in range(4):
-            k = index[2, c]
-            plane, plane_x, plane_y = 0.0, 0.0, 0.0
-            for b in range(4):
-                j = index[1, b]
-                line, line_x = 0.0, 0.0
-                for a in range(4):
-                    i = index[0, a]
-                    node = early * before[k, j, i] + late * after[k, j, i]
-                    line += weights[0, a] * node
-                    line_x += slopes[0, a] * node
-                plane += weights[1, b] * line
-                plane_x += weights[1, b] * line_x
-                plane_y += slopes[1, b] * line
-            value += weights[2, c] * plane
-            gx += weights[2, c] * plane_x
-            gy += weights[2, c] * plane_y
-            gz += slopes[2, c] * plane
-        distance_mm[number] = value
-        gradient[number, 0] = gx / spacing_mm[0]
-        gradient[number, 1] = gy / spacing_mm[1]
-        gradient[number, 2] = gz / spacing_mm[2]
+    for n in range(len(points_mm)):
+        phase = phases[n if len(phases) > 1 else 0]
+        value, gx, gy, gz = _at(
+            addresses, line, grid, points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase
+        )
+        distance_mm[n] = value
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
 
 
-@njit(nogil=True, cache=True)
-def _node_slope(distance_mm, k, j, i, dk, dj, di, spacing_mm):  # type: ignore[no-untyped-def]
-    """The interpolant's slope at a node: central, one-sided at the grid's ends."""
-    last = (distance_mm.shape[0] - 1, distance_mm.shape[1] - 1, distance_mm.shape[2] - 1)
-    k0, j0, i0 = max(k - dk, 0), max(j - dj, 0), max(i - di, 0)
-    k1, j1, i1 = min(k + dk, last[0]), min(j + dj, last[1]), min(i + di, last[2])
-    steps = (k1 - k0) + (j1 - j0) + (i1 - i0)
-    rise = np.float64(distance_mm[k1, j1, i1]) - np.float64(distance_mm[k0, j0, i0])
-    return rise / (steps * spacing_mm)
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def sample_force(addresses, line, grid, side, delta_mm, m, f_max_n, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
+    """Force at points into ``(n, 3)``; the arguments are those of ``sample`` and ``force_at``."""
+    for n in range(len(points_mm)):
+        phase = phases[n if len(phases) > 1 else 0]
+        fx, fy, fz = _force(
+            addresses, line, grid, side, delta_mm, m, f_max_n,
+            points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase,
+        )  # fmt: skip
+        force_n[n, 0], force_n[n, 1], force_n[n, 2] = fx, fy, fz
 
 
-@njit(nogil=True, cache=True)
-def node_forces(distance_mm, spacing_mm, side, delta_mm, m, f_max_n, force_n):  # type: ignore[no-untyped-def]
-    """The force at every node of one phase, into ``force_n`` ``(z, y, x, 3)``."""
-    for k in range(distance_mm.shape[0]):
-        for j in range(distance_mm.shape[1]):
-            for i in range(distance_mm.shape[2]):
-                gx = _node_slope(distance_mm, k, j, i, 0, 0, 1, spacing_mm[0])
-                gy = _node_slope(distance_mm, k, j, i, 0, 1, 0, spacing_mm[1])
-                gz = _node_slope(distance_mm, k, j, i, 1, 0, 0, spacing_mm[2])
-                length = np.sqrt(gx * gx + gy * gy + gz * gz)
-                size = _pull(np.float64(distance_mm[k, j, i]), side, delta_mm, m)
-                scale = -f_max_n * size * _direction_scale(length)
-                force_n[k, j, i, 0] = scale * gx
-                force_n[k, j, i, 1] = scale * gy
-                force_n[k, j, i, 2] = scale * gz
-
-
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
 def largest_steps(force_n, distance_mm, near_mm, steps_n):  # type: ignore[no-untyped-def]
     """Largest force step between neighbouring nodes, into ``steps_n`` ``(2, 3)``.
 
@@ -159,11 +219,11 @@ def largest_steps(force_n, distance_mm, near_mm, steps_n):  # type: ignore[no-un
                     if near and abs(distance_mm[k1, j1, i1]) <= near_mm:
                         steps_n[1, axis] = max(steps_n[1, axis], step2)
     for axis in range(3):
-        steps_n[0, axis] = np.sqrt(steps_n[0, axis])
-        steps_n[1, axis] = np.sqrt(steps_n[1, axis])
+        steps_n[0, axis] = math.sqrt(steps_n[0, axis])
+        steps_n[1, axis] = math.sqrt(steps_n[1, axis])
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
 def largest_change(before_n, after_n):  # type: ignore[no-untyped-def]
     """Largest change of force at a node between two phases, newtons."""
     largest = 0.0
@@ -174,4 +234,4 @@ def largest_change(before_n, after_n):  # type: ignore[no-untyped-def]
                 for part in range(3):
                     change2 += (after_n[k, j, i, part] - before_n[k, j, i, part]) ** 2
                 largest = max(largest, change2)
-    return np.sqrt(largest)
+    return math.sqrt(largest)

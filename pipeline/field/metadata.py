@@ -17,9 +17,9 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 Row = tuple[float, float, float, float]
 
 INTERPOLATION = {
-    "space": "tricubic Catmull-Rom of the distance; straight-line ghost nodes at the boundary; "
-    "points outside the grid are moved to its boundary",
-    "time": "linear between stored phases; the first follows the last",
+    "space": "quadratic B-spline whose coefficients are the arrays under spline/; beyond the "
+    "boundary they go on in a straight line; points outside the grid are moved to its boundary",
+    "time": "quadratic B-spline with knots halfway between phases; the first follows the last",
     "force": "-f_max * f(q) * direction, f and the direction from the interpolated distance",
     "direction": "gradient / max(length of the gradient, 0.5): a unit vector except near the "
     "medial axis, where it passes continuously through zero",
@@ -44,6 +44,8 @@ class StructurePart(Part):
     """One surface's distance."""
 
     path: str
+    spline: str
+    """Coefficients of the spline that takes these distances at the nodes and phases."""
     triangles: list[int]
     """Per phase."""
     volume_ml: list[float]
@@ -123,6 +125,8 @@ class FieldMetadata(Part):
             require_name(name, "structure")
             if structure.path != f"distance/{name}":
                 raise ValueError(f"structure {name}: path {structure.path!r} is not its own")
+            if structure.spline != f"spline/{name}":
+                raise ValueError(f"structure {name}: spline {structure.spline!r} is not its own")
         for name, fixture in self.fixtures.items():
             require_name(name, "fixture")
             if fixture.path != f"potential/{name}":
@@ -134,8 +138,9 @@ class FieldMetadata(Part):
     @property
     def arrays(self) -> list[str]:
         """Paths of all arrays in the store."""
-        structures = [structure.path for structure in self.structures.values()]
-        return structures + [fixture.path for fixture in self.fixtures.values()]
+        parts = self.structures.values()
+        fixtures = [fixture.path for fixture in self.fixtures.values()]
+        return [part.path for part in parts] + fixtures + [part.spline for part in parts]
 
 
 def require_phases(phases: list[float], where: str) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -21,23 +23,29 @@ from pipeline.errors import InputError
 from pipeline.field.fixture import Fixture
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.metadata import FieldMetadata
-from pipeline.field.potential import direction_scale, offence, potential, pull
+from pipeline.field.potential import offence, potential
+from pipeline.field.spline import timeline
 from pipeline.geometry import Float, Float32, Grid, Mask
 
 ATTRIBUTES = "zarr.json"
+POINTS_A_WORKER = 16_384
+"""Fewer points are answered before another thread would have started."""
 
 
 class ForceField:
     """A moving distance field and the forces of its fixtures, in LPS mm of the MR frame.
 
-    The distance is interpolated by tricubic Catmull-Rom splines in space (exact at the nodes,
-    with a continuous gradient) and linearly between phases, the first following the last. The
-    gradient is the exact derivative of that interpolant; potential and force are the formulas
-    evaluated on it, so the force has no step at voxel faces or at phases.
+    Between nodes and phases the distance is a quadratic B-spline in space and time that takes
+    the stored distance at every node and phase (to the rounding of float32). Its gradient is
+    exact, and neither it nor the rate of change has a step at voxel faces, at phases, or where
+    the cycle closes. Potential and force are the formulas evaluated on it.
 
     The direction of the force is ``g / max(|g|, 0.5)`` for the gradient g: a unit vector except
     near the medial axis, where two parts of the surface are equally near; there the force passes
     continuously through zero, along an axis of the grid at no more than 8 f_max / spacing.
+
+    Questions of many points are shared among the processors; the answers do not depend on how
+    many there are. ``force_at`` and ``distance_at`` answer for one point at the least cost.
 
     Points outside the grid are treated as the nearest point of its boundary, which is continuous
     but says less the farther out they are: ask ``contains``.
@@ -51,15 +59,28 @@ class ForceField:
         )
         grid = metadata.grid
         self._grid = Grid(grid.shape_zyx, grid.origin_mm, grid.spacing_mm)
-        self._origin_mm = np.array(grid.origin_mm)
-        self._spacing_mm = np.array(grid.spacing_mm)
         self._phases = np.array(metadata.phases)
-        self._since_first = self._phases - self._phases[0]
-        self._gaps = np.diff(self._since_first, append=1.0)
-        self._distances = {
-            name: [map_phase(path / part.path, k, self._grid) for k in range(len(self._phases))]
-            for name, part in metadata.structures.items()
+        self._numbers = np.array([*grid.origin_mm, *grid.spacing_mm, *grid.shape_zyx[::-1]])
+        self._line = timeline(self._phases)
+        parts = metadata.structures
+        self._distances = {name: self._map(part.path) for name, part in parts.items()}
+        self._coefficients = {name: self._map(part.spline) for name, part in parts.items()}
+        self._addresses = {
+            name: np.array([phase.ctypes.data for phase in mapped], dtype=np.uintp)
+            for name, mapped in self._coefficients.items()
         }
+        self._laws = {
+            name: (
+                self._addresses[law.structure], self._line, self._numbers,
+                law.side_code, law.resolved_delta_mm, law.m, law.f_max_n,
+            )
+            for name, law in self._fixtures.items()
+        }  # fmt: skip
+        self._first = next(iter(self._fixtures))
+
+    def _map(self, part: str) -> list[Float32]:
+        count = len(self._phases)
+        return [map_phase(self._path / part, index, self._grid) for index in range(count)]
 
     @classmethod
     def open(cls, path: Path | str) -> ForceField:
@@ -119,7 +140,7 @@ class ForceField:
     def contains(self, points_mm: npt.ArrayLike) -> Mask:
         """Which of ``(n, 3)`` points lie in the grid."""
         points = _as_points(points_mm)
-        inside = (points >= self._origin_mm) & (points <= self._grid.upper_mm)
+        inside = (points >= self._grid.origin_mm) & (points <= self._grid.upper_mm)
         return np.asarray(inside.all(axis=1))
 
     def stored_distance_mm(self, structure: str, index: int) -> Float32:
@@ -173,63 +194,130 @@ class ForceField:
 
         ``-f_max f(q) direction``, with the direction in which the potential rises.
         """
-        law = self._fixture(fixture)
-        distance_mm, gradient = self._sample(points_mm, phase, law.structure)
-        size = pull(distance_mm, law.side_code, law.resolved_delta_mm, law.m)
-        length = np.sqrt(np.einsum("ij,ij->i", gradient, gradient))
-        force: Float = (-law.f_max_n * size * direction_scale(length))[:, None] * gradient
-        return force
+        from pipeline.field.kernels import sample_force
+
+        self._fixture(fixture)
+        law = self._laws[fixture or self._first]
+        points = _as_points(points_mm)
+        phases = _as_phases(phase, len(points))
+        force_n = np.empty((len(points), 3))
+        _in_parts(
+            lambda part, moments: sample_force(*law, points[part], moments, force_n[part]),
+            phases,
+            len(points),
+        )
+        return force_n
+
+    def distance_at(
+        self, x_mm: float, y_mm: float, z_mm: float, phase: float, structure: str | None = None
+    ) -> float:
+        """Signed distance in mm at one point; as ``distance_mm``, without arrays.
+
+        Raises
+        ------
+        InputError
+            When a number is not finite, or the structure unknown.
+        """
+        kernel = self._distance_at or self._load()[0]
+        try:
+            addresses = self._addresses[structure or self._fixtures[self._first].structure]
+        except KeyError:
+            raise self._unknown("structure", structure, self._addresses) from None
+        found: float = kernel(addresses, self._line, self._numbers, x_mm, y_mm, z_mm, phase)[0]
+        if found != found:
+            raise _not_finite(x_mm, y_mm, z_mm, phase)
+        return found
+
+    def force_at(
+        self, x_mm: float, y_mm: float, z_mm: float, phase: float, fixture: str | None = None
+    ) -> tuple[float, float, float]:
+        """Force on a tool at one point, newtons along x, y, z; as ``force_n``, without arrays.
+
+        Raises
+        ------
+        InputError
+            When a number is not finite, or the fixture unknown.
+        """
+        kernel = self._force_at or self._load()[1]
+        try:
+            law = self._laws[fixture or self._first]
+        except KeyError:
+            raise self._unknown("fixture", fixture, self._laws) from None
+        force_n: tuple[float, float, float] = kernel(*law, x_mm, y_mm, z_mm, phase)
+        if force_n[0] != force_n[0]:
+            raise _not_finite(x_mm, y_mm, z_mm, phase)
+        return force_n
+
+    _distance_at: Any = None
+    _force_at: Any = None
+
+    def _load(self) -> tuple[Any, Any]:
+        """Compile or load the kernels at the first question."""
+        from pipeline.field import kernels
+
+        self._distance_at, self._force_at = kernels.distance_at, kernels.force_at
+        return self._distance_at, self._force_at
+
+    def _unknown(self, what: str, name: str | None, known: Mapping[str, Any]) -> InputError:
+        return InputError(f"{self._path}: no {what} {name!r}; there are {', '.join(known)}")
 
     def _fixture(self, name: str | None) -> Fixture:
         if name is None:
-            return next(iter(self._fixtures.values()))
+            return self._fixtures[self._first]
         if name not in self._fixtures:
-            raise InputError(
-                f"{self._path}: no fixture {name!r}; there are {', '.join(self._fixtures)}"
-            )
+            raise self._unknown("fixture", name, self._fixtures)
         return self._fixtures[name]
 
     def _structure(self, name: str | None) -> str:
         if name is None:
             return self._fixture(None).structure
         if name not in self._distances:
-            raise InputError(
-                f"{self._path}: no structure {name!r}; there are {', '.join(self._distances)}"
-            )
+            raise self._unknown("structure", name, self._distances)
         return name
 
     def _sample(
         self, points_mm: npt.ArrayLike, phase: npt.ArrayLike, structure: str
     ) -> tuple[Float, Float]:
-        from pipeline.field.kernels import interpolate
+        from pipeline.field.kernels import sample
 
         points = _as_points(points_mm)
-        index, share = self._place(_as_phases(phase, len(points)))
+        phases = _as_phases(phase, len(points))
         distance_mm, gradient = np.empty(len(points)), np.empty((len(points), 3))
-        volumes = self._distances[structure]
-        for k in np.unique(index):
-            chosen = slice(None) if len(index) == 1 else np.flatnonzero(index == k)
-            one_mm, slope = distance_mm[chosen], gradient[chosen]
-            interpolate(
-                volumes[k],
-                volumes[(k + 1) % len(volumes)],
-                np.broadcast_to(share, len(points))[chosen].astype(np.float64),
-                self._origin_mm,
-                self._spacing_mm,
-                points[chosen],
-                one_mm,
-                slope,
-            )
-            distance_mm[chosen], gradient[chosen] = one_mm, slope
+        field = (self._addresses[structure], self._line, self._numbers)
+        _in_parts(
+            lambda part, moments: sample(
+                *field, points[part], moments, distance_mm[part], gradient[part]
+            ),
+            phases,
+            len(points),
+        )
         return distance_mm, gradient
 
-    def _place(self, phase: Float) -> tuple[npt.NDArray[np.intp], Float]:
-        """Stored phase at or before each phase, and the share of the one after it."""
-        since = np.mod(phase - self._phases[0], 1.0)
-        # The remainder of a tiny negative number rounds to 1 itself.
-        since[since >= 1.0] = 0.0
-        index = np.searchsorted(self._since_first, since, side="right") - 1
-        return index, (since - self._since_first[index]) / self._gaps[index]
+
+def _in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) -> None:
+    """Ask about ``count`` points, shared among the processors where they are many."""
+
+    def part(start: int, end: int) -> None:
+        ask(slice(start, end), phases if len(phases) == 1 else phases[start:end])
+
+    workers = min(processors(), count // POINTS_A_WORKER)
+    if workers < 2:
+        part(0, count)
+        return
+    edges = np.linspace(0, count, workers + 1).astype(int).tolist()
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(part, edges[:-1], edges[1:]))
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+
+
+def _not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
+    return InputError(
+        f"point ({x_mm}, {y_mm}, {z_mm}) mm at phase {phase} is not finite; every number must be"
+    )
 
 
 def _as_points(points_mm: npt.ArrayLike) -> Float:

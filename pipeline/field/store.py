@@ -13,8 +13,13 @@ import numpy as np
 
 from pipeline.field.manifest import write_manifest
 from pipeline.field.metadata import FieldMetadata
+from pipeline.field.reader import chunk_path
+from pipeline.field.spline import time_solver
 from pipeline.field.verify import Report, verify_field
 from pipeline.geometry import Float32
+
+SLAB = 65_536
+"""Nodes whose whole cycle is in memory at once."""
 
 __all__ = ["FieldWriter", "Report", "verify_field"]
 
@@ -27,6 +32,7 @@ class FieldWriter:
         import zarr
 
         self._path = path
+        self._metadata = metadata
         self._group = zarr.create_group(path, zarr_format=3, attributes=attributes(metadata))
         self._arrays = {name: self._create(name, metadata) for name in metadata.arrays}
 
@@ -50,6 +56,23 @@ class FieldWriter:
     def write(self, name: str, index: int, values: Float32) -> None:
         """Write phase ``index`` of the array ``name``, ``(z, y, x)``."""
         self._arrays[name][index] = values
+
+    def solve_splines_in_time(self) -> None:
+        """Turn the spline arrays, so far solved in space phase by phase, into the final ones.
+
+        A slab of nodes is in memory at a time, all its phases together.
+        """
+        solver = time_solver(np.array(self._metadata.phases))
+        for part in self._metadata.structures.values():
+            mapped = [
+                np.memmap(chunk_path(self._path / part.spline, index), dtype="<f4", mode="r+")
+                for index in range(len(solver))
+            ]
+            for start in range(0, len(mapped[0]), SLAB):
+                slab = np.stack([phase[start : start + SLAB] for phase in mapped])
+                solved = solver @ slab.astype(np.float64)
+                for phase, values in zip(mapped, solved, strict=True):
+                    phase[start : start + SLAB] = values
 
     def finish(self, metadata: FieldMetadata) -> None:
         """Write the final attributes, then the manifest."""

@@ -12,10 +12,11 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.field.manifest import MANIFEST, canonical_manifest, entry
-from pipeline.field.metadata import FieldMetadata, FixturePart
+from pipeline.field.metadata import FieldMetadata, FixturePart, StructurePart
 from pipeline.field.potential import offence, potential
 from pipeline.field.reader import map_phase, read_metadata
-from pipeline.geometry import Grid
+from pipeline.field.spline import node_values, phase_weights, timeline
+from pipeline.geometry import Float, Grid
 
 # Stored potentials are rounded to float32: half a step below 1 is 2^-25. Another machine's
 # exponential may differ in its last bit, which can move the rounding by one step, 2^-24.
@@ -174,10 +175,29 @@ def _value_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
                 yield f"{structure.path}: phase {index} holds values that are not finite"
                 continue
             distance_mm = values.astype(np.float64)
+            yield from _spline_problems(path, metadata, structure, index, distance_mm)
             for fixture in metadata.fixtures.values():
                 if fixture.structure == name:
                     stored = map_phase(path / fixture.path, index, grid)
                     yield from _potential_problems(stored, distance_mm, fixture, index)
+
+
+def _spline_problems(
+    path: Path, metadata: FieldMetadata, part: StructurePart, index: int, distance_mm: Float
+) -> Iterator[str]:
+    """The spline must take the stored distances at the nodes of every phase."""
+    grid = Grid(metadata.grid.shape_zyx, metadata.grid.origin_mm, metadata.grid.spacing_mm)
+    phases = metadata.phases
+    k, weights = phase_weights(timeline(np.array(phases)), phases[index])
+    coefficients = np.zeros(grid.shape)
+    for step, weight in zip((-1, 0, 1), weights, strict=True):
+        mapped = map_phase(path / part.spline, (k + step) % len(phases), grid)
+        coefficients += weight * mapped
+    off_mm = np.abs(node_values(coefficients) - distance_mm).max()
+    # Coefficients and distances are each rounded to float32, by 2^-24 of themselves at most;
+    # solving along three axes and in time enlarges the former to no more than 16 of them.
+    if not off_mm <= 16 * 2.0**-24 * max(np.abs(coefficients).max(), 1.0):
+        yield f"{part.spline}: phase {index} misses {part.path} by {off_mm:.2g} mm at a node"
 
 
 def _potential_problems(
