@@ -12,9 +12,16 @@ if TYPE_CHECKING:
     from pipeline.field.fixture import BakeSettings, Fixture
     from pipeline.field.reader import ForceField
 
-__all__ = ["BakeSettings", "Fixture", "ForceField"]
+__all__ = ["BakeSettings", "Fixture", "ForceField", "get_include"]
 
 _HOMES = {"BakeSettings": "fixture", "Fixture": "fixture", "ForceField": "reader"}
+
+
+def get_include() -> str:
+    """Folder of ``beatfield.h``, the reader for C and C++: ``cc -I $(...)``."""
+    from pathlib import Path
+
+    return str(Path(__file__).parent / "include")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,1266 @@
+/* beatfield.h - ask a baked field for distance, potential and force, in C99 or C++11.
+ *
+ * In one source file of a program:
+ *
+ *     #define BEATFIELD_IMPLEMENTATION
+ *     #include "beatfield.h"
+ *
+ * and everywhere else just the #include. That file should include this header first, for POSIX
+ * systems then declare what mapping files needs. No other library is needed but libm.
+ *
+ *     bf_field field;
+ *     if (bf_open(&field, "OUT/patient-0001/bake/field.zarr") != BF_OK) ...
+ *     bf_lock(&field);                              pages in memory, before the loop starts
+ *     int guide = bf_fixture(&field, "epicardium_guidance");
+ *     double force_n[3];
+ *     bf_force(&field, guide, point_mm, phase, force_n);      as often as you like
+ *     bf_close(&field);
+ *
+ * Points are (x, y, z) millimetres in the patient's LPS frame of the MR, phases are shares of the
+ * heartbeat since the R peak (any number; its fraction counts), transforms are row-major 4x4 on
+ * column points. Distances are negative inside. A query allocates nothing and calls no system
+ * function, so it is safe in a real-time loop and from several threads at once.
+ *
+ * The distance between nodes and phases is the quadratic B-spline whose coefficients the store
+ * holds under spline/: neither its gradient nor its rate has a step anywhere. Potential and force
+ * are f(q) = 1 - exp(-(q^2 / (2 delta^2))^m) and -f_max f(q) grad q, with q the distance (guidance)
+ * or the depth of penetration (forbidden region) and a gradient of unit length, except near the
+ * medial axis, where the force passes through zero without a step.
+ */
+#ifndef BEATFIELD_H
+#define BEATFIELD_H
+
+#if defined(BEATFIELD_IMPLEMENTATION) && !defined(_WIN32) && !defined(_POSIX_C_SOURCE)
+#define _POSIX_C_SOURCE 200809L
+#endif
+
+#include <stddef.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define BF_NAME 64 /* longest name of a structure or fixture, with its end */
+
+typedef enum {
+    BF_OK = 0,
+    BF_CANNOT_READ,  /* a file is missing, or may not be read */
+    BF_NOT_A_FIELD,  /* no manifest, or a description that is not that of a field */
+    BF_WRONG_SIZE,   /* a file's size is not what the description says */
+    BF_DAMAGED,      /* a file's SHA-256 is not what the manifest says */
+    BF_NO_MEMORY,    /* malloc or mmap refused */
+    BF_CANNOT_LOCK,  /* mlock refused (ulimit -l); pages are in memory, but may be paged out */
+    BF_NO_SUCH_NAME, /* number of a structure or fixture that is not there */
+    BF_NOT_FINITE    /* a coordinate or phase is infinite or not a number */
+} bf_status;
+
+typedef struct {
+    char name[BF_NAME];
+    const float **coefficients; /* one array a phase, (z, y, x) */
+} bf_structure_part;
+
+typedef struct {
+    char name[BF_NAME];
+    int structure;   /* number of the surface that acts */
+    int side;        /* 0 guidance, +1 outside forbidden, -1 inside forbidden */
+    int m;           /* sharpness */
+    double delta_mm; /* width */
+    double f_max_n;  /* largest force */
+} bf_fixture_part;
+
+typedef struct {
+    int shape[3]; /* nodes along x, y, z */
+    double origin_mm[3], spacing_mm[3];
+    int phases;
+    double *phase;       /* stored phases, rising in [0, 1) */
+    double *line;        /* four numbers a phase: where which weights hold */
+    double rr_s;         /* heartbeat when the images were taken; 0 where unknown */
+    int registered;      /* whether mr_from_tracker is known */
+    double mr_from_tracker[16];
+    int structures, fixtures;
+    bf_structure_part *structure;
+    bf_fixture_part *fixture;
+    size_t bytes; /* of one phase of one array */
+} bf_field;
+
+/* What a status means, in a few words. */
+const char *bf_text(bf_status status);
+
+/* Map a field.zarr into memory. On failure the field is as bf_close leaves it. */
+bf_status bf_open(bf_field *field, const char *path);
+
+/* Compare every file of a field.zarr with its manifest (reads all of it; not for the loop). */
+bf_status bf_verify(const char *path);
+
+/* Bring all pages into memory and keep them there. */
+bf_status bf_lock(bf_field *field);
+
+/* Give everything back; harmless twice. */
+void bf_close(bf_field *field);
+
+/* Number of a structure or fixture by name; -1 where there is none. */
+int bf_structure(const bf_field *field, const char *name);
+int bf_fixture(const bf_field *field, const char *name);
+
+/* Signed distance in mm and its gradient; either may be NULL. */
+bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
+                      double *distance_mm, double gradient[3]);
+
+/* Potential of a fixture, in [0, 1). */
+bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
+                       double *potential);
+
+/* Force of a fixture on a tool's point, newtons. */
+bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
+                   double force_n[3]);
+
+/* Forces at many points, (count, 3) numbers each; phases has one number, or count of them. */
+bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
+                    const double *phases, size_t phase_count, double *forces_n);
+
+/* A rigid tool: straight pieces through points of its own frame, from the first to the last, and
+ * back to the first where it is closed. */
+typedef struct {
+    const double *points_mm; /* (count, 3) numbers */
+    int count;               /* 1 makes a tool that is a point */
+    int closed;
+    double handle_mm[3]; /* where the hand holds it: torque is about this point */
+} bf_tool;
+
+/* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL):
+ * the mean of the field's force over the tool's length, so no tool feels more than f_max. Pieces
+ * are halved where the field demands it, until the error of the force is below bound_n; evaluations
+ * (may be NULL) says how often the field was asked. */
+bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
+                        const double mr_from_tool[16], double phase, double bound_n,
+                        double force_n[3], double torque_nmm[3], int *evaluations);
+
+/* target = transform * point; the arrays may be the same. */
+void bf_transform(const double transform[16], const double point_mm[3], double moved_mm[3]);
+
+/* Parse the text of a store's zarr.json; bf_open does it, this is for tests. */
+bf_status bf_describe(bf_field *field, const char *text, size_t length);
+
+#ifdef __cplusplus
+}
+#endif
+#endif /* BEATFIELD_H */
+
+#ifdef BEATFIELD_IMPLEMENTATION
+#undef BEATFIELD_IMPLEMENTATION
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#ifndef _WIN32
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+#endif
+
+const char *bf_text(bf_status status)
+{
+    switch (status) {
+    case BF_OK: return "done";
+    case BF_CANNOT_READ: return "a file is missing or cannot be read";
+    case BF_NOT_A_FIELD: return "no complete field: bake it again";
+    case BF_WRONG_SIZE: return "a file has the wrong size: bake it again";
+    case BF_DAMAGED: return "a file is not what the manifest says: bake it again";
+    case BF_NO_MEMORY: return "no memory";
+    case BF_CANNOT_LOCK: return "pages cannot be locked: raise the limit (ulimit -l)";
+    case BF_NO_SUCH_NAME: return "no such structure or fixture";
+    case BF_NOT_FINITE: return "a coordinate or phase is not finite";
+    }
+    return "unknown status";
+}
+
+/* ---- JSON, as far as needed: a cursor over a text; nothing is copied ---- */
+
+typedef struct {
+    const char *at, *end;
+    int bad; /* once set, the cursor stays where it is */
+} bf__json;
+
+enum { BF__DEPTH = 64 };
+
+static void bf__blank(bf__json *j)
+{
+    while (j->at < j->end && (*j->at == ' ' || *j->at == '\n' || *j->at == '\r' || *j->at == '\t'))
+        j->at++;
+}
+
+/* Step over a character if it is next. */
+static int bf__take(bf__json *j, char wanted)
+{
+    bf__blank(j);
+    if (j->bad || j->at >= j->end || *j->at != wanted) return 0;
+    j->at++;
+    return 1;
+}
+
+static void bf__need(bf__json *j, char wanted)
+{
+    if (!bf__take(j, wanted)) j->bad = 1;
+}
+
+/* A string without its quotes; escapes are left as they are, for no name of ours has one. */
+static void bf__string(bf__json *j, const char **start, size_t *length)
+{
+    *start = j->end;
+    *length = 0;
+    bf__need(j, '"');
+    if (j->bad) return;
+    *start = j->at;
+    while (j->at < j->end && *j->at != '"') {
+        if (*j->at == '\\' && j->at + 1 < j->end) j->at++;
+        j->at++;
+    }
+    if (j->at >= j->end) {
+        j->bad = 1;
+        return;
+    }
+    *length = (size_t)(j->at - *start);
+    j->at++;
+}
+
+/* A number, whatever the program's locale says of decimal points; rounded to a few 1e-16. */
+static double bf__number(bf__json *j)
+{
+    double value = 0, scale = 1;
+    int negative, digits = 0, exponent = 0, power = 0, down;
+    bf__blank(j);
+    if (j->bad) return 0;
+    negative = j->at < j->end && *j->at == '-';
+    if (negative) j->at++;
+    for (; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++)
+        value = 10 * value + (*j->at - '0');
+    if (j->at < j->end && *j->at == '.') {
+        for (j->at++; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++) {
+            /* Digits past the seventeenth change nothing. */
+            if (scale < 1e17) {
+                value = 10 * value + (*j->at - '0');
+                scale *= 10;
+            }
+        }
+    }
+    if (digits && j->at < j->end && (*j->at == 'e' || *j->at == 'E')) {
+        j->at++;
+        down = j->at < j->end && *j->at == '-';
+        if (j->at < j->end && (*j->at == '-' || *j->at == '+')) j->at++;
+        for (digits = 0; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++)
+            if (power < 1000) power = 10 * power + (*j->at - '0');
+        exponent = down ? -power : power;
+    }
+    if (!digits) j->bad = 1;
+    value /= scale;
+    if (exponent) value *= pow(10.0, exponent);
+    return negative ? -value : value;
+}
+
+static void bf__skip(bf__json *j, int depth)
+{
+    const char *text;
+    size_t length;
+    char close;
+    bf__blank(j);
+    if (j->bad || j->at >= j->end || depth > BF__DEPTH) {
+        j->bad = 1;
+        return;
+    }
+    if (*j->at == '"') {
+        bf__string(j, &text, &length);
+    } else if (*j->at == '{' || *j->at == '[') {
+        close = *j->at == '{' ? '}' : ']';
+        j->at++;
+        if (bf__take(j, close)) return;
+        do {
+            if (close == '}') {
+                bf__string(j, &text, &length);
+                bf__need(j, ':');
+            }
+            bf__skip(j, depth + 1);
+        } while (bf__take(j, ','));
+        bf__need(j, close);
+    } else if ((*j->at >= '0' && *j->at <= '9') || *j->at == '-') {
+        bf__number(j);
+    } else {
+        for (length = 0; j->at < j->end && *j->at >= 'a' && *j->at <= 'z'; j->at++) length++;
+        /* true, false, null */
+        if (length < 4 || length > 5) j->bad = 1;
+    }
+}
+
+/* Go through an object: 1 and the next key, with the cursor at its value; 0 behind its end. */
+static int bf__key(bf__json *j, int *first, const char **key, size_t *length)
+{
+    if (*first) {
+        bf__need(j, '{');
+        *first = 0;
+        if (bf__take(j, '}')) return 0;
+    } else if (!bf__take(j, ',')) {
+        bf__need(j, '}');
+        return 0;
+    }
+    bf__string(j, key, length);
+    bf__need(j, ':');
+    return !j->bad;
+}
+
+/* The same for an array: 1 with the cursor at the next value. */
+static int bf__item(bf__json *j, int *first)
+{
+    if (*first) {
+        bf__need(j, '[');
+        *first = 0;
+        return !bf__take(j, ']') && !j->bad;
+    }
+    if (bf__take(j, ',')) return 1;
+    bf__need(j, ']');
+    return 0;
+}
+
+static int bf__is(const char *key, size_t length, const char *name)
+{
+    return strlen(name) == length && memcmp(key, name, length) == 0;
+}
+
+static int bf__null(bf__json *j)
+{
+    bf__blank(j);
+    if (j->bad || j->end - j->at < 4 || memcmp(j->at, "null", 4) != 0) return 0;
+    j->at += 4;
+    return 1;
+}
+
+/* Numbers of an array into values, room for capacity of them; how many there were. */
+static int bf__numbers(bf__json *j, double *values, int capacity)
+{
+    int first = 1, count = 0;
+    while (bf__item(j, &first)) {
+        double value = bf__number(j);
+        if (count >= capacity) {
+            j->bad = 1;
+            return count;
+        }
+        values[count++] = value;
+    }
+    return count;
+}
+
+static void bf__name(bf__json *j, const char *start, size_t length, char name[BF_NAME])
+{
+    size_t n;
+    if (length == 0 || length >= BF_NAME) {
+        j->bad = 1;
+        length = 0;
+    }
+    for (n = 0; n < length; n++) {
+        char c = start[n];
+        if (!((c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') ||
+              (n && (c == '_' || c == '-'))))
+            j->bad = 1;
+    }
+    memcpy(name, start, length);
+    name[length] = 0;
+}
+
+/* How many entries an object at the cursor has; the cursor stays. */
+static int bf__entries(bf__json j)
+{
+    const char *key;
+    size_t length;
+    int first = 1, count = 0;
+    while (bf__key(&j, &first, &key, &length)) {
+        bf__skip(&j, 0);
+        count++;
+    }
+    return j.bad ? 0 : count;
+}
+
+/* ---- what a store says of itself ---- */
+
+enum { BF__MOST_PHASES = 4096, BF__MOST_PARTS = 1024 };
+
+static void bf__grid(bf__json *j, bf_field *field)
+{
+    const char *key;
+    size_t length;
+    double shape[3] = {0, 0, 0};
+    int first = 1, axis, found = 0;
+    while (bf__key(j, &first, &key, &length)) {
+        if (bf__is(key, length, "shape_zyx")) found += bf__numbers(j, shape, 3);
+        else if (bf__is(key, length, "origin_mm")) found += bf__numbers(j, field->origin_mm, 3);
+        else if (bf__is(key, length, "spacing_mm")) found += bf__numbers(j, field->spacing_mm, 3);
+        else bf__skip(j, 0);
+    }
+    for (axis = 0; axis < 3; axis++) {
+        if (!(shape[2 - axis] >= 2 && shape[2 - axis] <= 65536)) j->bad = 1;
+        else field->shape[axis] = (int)shape[2 - axis];
+        if (!(field->spacing_mm[axis] > 1e-6 && field->spacing_mm[axis] < 1e6)) j->bad = 1;
+        if (!(fabs(field->origin_mm[axis]) < 1e9)) j->bad = 1;
+    }
+    if (found != 9) j->bad = 1;
+}
+
+static void bf__phases(bf__json *j, bf_field *field)
+{
+    double *values = (double *)malloc(BF__MOST_PHASES * sizeof(double));
+    int count, k;
+    if (!values) {
+        j->bad = 1;
+        return;
+    }
+    count = bf__numbers(j, values, BF__MOST_PHASES);
+    for (k = 0; k < count; k++)
+        if (!(values[k] >= 0 && values[k] < 1 && (k == 0 || values[k] > values[k - 1]))) j->bad = 1;
+    if (count < 1 || field->phase) j->bad = 1;
+    if (j->bad) {
+        free(values);
+        return;
+    }
+    field->phases = count;
+    field->phase = values;
+}
+
+static void bf__transform(bf__json *j, bf_field *field)
+{
+    int first = 1, row = 0;
+    if (bf__null(j)) return;
+    while (bf__item(j, &first)) {
+        if (row >= 4 || bf__numbers(j, field->mr_from_tracker + 4 * row, 4) != 4) {
+            j->bad = 1;
+            return;
+        }
+        row++;
+    }
+    field->registered = row == 4;
+    if (row != 4) j->bad = 1;
+}
+
+static void bf__structures(bf__json *j, bf_field *field)
+{
+    const char *key;
+    size_t length;
+    int first = 1, count = bf__entries(*j);
+    if (count < 1 || count > BF__MOST_PARTS || field->structure) {
+        j->bad = 1;
+        return;
+    }
+    field->structure = (bf_structure_part *)calloc((size_t)count, sizeof(bf_structure_part));
+    if (!field->structure) {
+        j->bad = 1;
+        return;
+    }
+    while (bf__key(j, &first, &key, &length) && field->structures < count) {
+        bf__name(j, key, length, field->structure[field->structures++].name);
+        bf__skip(j, 0);
+    }
+}
+
+/* A fixture names its structure; the names are matched when all is read. */
+static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structure, size_t *size)
+{
+    const char *key, *text;
+    size_t length, span;
+    double m = 0;
+    int first = 1;
+    while (bf__key(j, &first, &key, &length)) {
+        if (bf__is(key, length, "structure")) bf__string(j, structure, size);
+        else if (bf__is(key, length, "delta_mm")) part->delta_mm = bf__number(j);
+        else if (bf__is(key, length, "f_max_n")) part->f_max_n = bf__number(j);
+        else if (bf__is(key, length, "m")) m = bf__number(j);
+        else if (bf__is(key, length, "side") && !bf__null(j)) {
+            bf__string(j, &text, &span);
+            part->side = bf__is(text, span, "outside") ? 1 : -1;
+            if (part->side < 0 && !bf__is(text, span, "inside")) j->bad = 1;
+        } else if (!bf__is(key, length, "side")) bf__skip(j, 0);
+    }
+    if (!(m >= 1 && m <= 1000) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
+        !(part->f_max_n > 0 && part->f_max_n < 1e9))
+        j->bad = 1;
+    else part->m = (int)m;
+}
+
+static void bf__fixtures(bf__json *j, bf_field *field, bf__json described)
+{
+    const char *key, *structure;
+    size_t length, size;
+    int first = 1, n, count = bf__entries(*j);
+    bf_field named = *field;
+    if (count < 1 || count > BF__MOST_PARTS || field->fixture) {
+        j->bad = 1;
+        return;
+    }
+    /* Structures may stand behind the fixtures in the text. */
+    if (!field->structure) bf__structures(&described, &named);
+    field->structure = named.structure;
+    field->structures = named.structures;
+    field->fixture = (bf_fixture_part *)calloc((size_t)count, sizeof(bf_fixture_part));
+    if (!field->fixture || described.bad) {
+        j->bad = 1;
+        return;
+    }
+    while (bf__key(j, &first, &key, &length) && field->fixtures < count) {
+        bf_fixture_part *part = &field->fixture[field->fixtures++];
+        bf__name(j, key, length, part->name);
+        structure = NULL;
+        size = 0;
+        bf__fixture(j, part, &structure, &size);
+        part->structure = -1;
+        for (n = 0; structure && n < field->structures; n++)
+            if (bf__is(structure, size, field->structure[n].name)) part->structure = n;
+        if (part->structure < 0) j->bad = 1;
+    }
+}
+
+/* Weights in time: for each phase start, end, early and late of the interval about it. */
+static bf_status bf__timeline(bf_field *field)
+{
+    int k, count = field->phases;
+    const double *p = field->phase;
+    field->line = (double *)malloc(4 * (size_t)count * sizeof(double));
+    if (!field->line) return BF_NO_MEMORY;
+    for (k = 0; k < count; k++) {
+        double *line = field->line + 4 * k;
+        double knot[4];
+        int n;
+        for (n = 0; n < 4; n++) {
+            /* Knot n lies between phases k + n - 2 and k + n - 1, the cycle repeated. */
+            int low = k + n - 2, high = k + n - 1;
+            double turns_low = floor((double)low / count), turns_high = floor((double)high / count);
+            knot[n] = (p[low - (int)turns_low * count] + turns_low +
+                       p[high - (int)turns_high * count] + turns_high) / 2;
+        }
+        line[0] = knot[1];
+        line[1] = knot[2];
+        line[2] = 1 / ((knot[2] - knot[1]) * (knot[2] - knot[0]));
+        line[3] = 1 / ((knot[2] - knot[1]) * (knot[3] - knot[1]));
+    }
+    return BF_OK;
+}
+
+/* Find a key of the object at the cursor and put the cursor at its value. */
+static int bf__find(bf__json *j, const char *name)
+{
+    const char *key;
+    size_t length;
+    int first = 1;
+    while (bf__key(j, &first, &key, &length)) {
+        if (bf__is(key, length, name)) return 1;
+        bf__skip(j, 0);
+    }
+    return 0;
+}
+
+bf_status bf_describe(bf_field *field, const char *text, size_t length)
+{
+    bf__json j, parts;
+    const char *key;
+    size_t span;
+    int first = 1, version = 0, gridded = 0;
+    bf_status status;
+    memset(field, 0, sizeof *field);
+    j.at = text;
+    j.end = text + length;
+    j.bad = 0;
+    if (!bf__find(&j, "attributes") || !bf__find(&j, "beatfield")) return BF_NOT_A_FIELD;
+    parts = j;
+    if (!bf__find(&parts, "structures")) return BF_NOT_A_FIELD;
+    while (bf__key(&j, &first, &key, &span)) {
+        if (bf__is(key, span, "format_version")) version = bf__number(&j) == 1.0;
+        else if (bf__is(key, span, "phases")) bf__phases(&j, field);
+        else if (bf__is(key, span, "rr_s")) field->rr_s = bf__null(&j) ? 0 : bf__number(&j);
+        else if (bf__is(key, span, "mr_from_tracker")) bf__transform(&j, field);
+        else if (bf__is(key, span, "grid")) {
+            bf__grid(&j, field);
+            gridded++;
+        } else if (bf__is(key, span, "structures") && !field->structure) bf__structures(&j, field);
+        else if (bf__is(key, span, "fixtures")) bf__fixtures(&j, field, parts);
+        else bf__skip(&j, 0);
+    }
+    if (j.bad || version != 1 || gridded != 1 || !field->phase || !field->structure ||
+        !field->fixture) {
+        bf_close(field);
+        return BF_NOT_A_FIELD;
+    }
+    field->bytes = sizeof(float) * (size_t)field->shape[0] * (size_t)field->shape[1] *
+                   (size_t)field->shape[2];
+    status = bf__timeline(field);
+    if (status != BF_OK) bf_close(field);
+    return status;
+}
+
+/* ---- SHA-256 (FIPS 180-4) ---- */
+
+typedef struct {
+    uint32_t state[8];
+    uint64_t bytes;
+    unsigned char block[64];
+} bf__sha;
+
+static uint32_t bf__turn(uint32_t value, int by) { return (value >> by) | (value << (32 - by)); }
+
+static void bf__sha_block(bf__sha *sha, const unsigned char *block)
+{
+    static const uint32_t k[64] = {
+        0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4,
+        0xab1c5ed5, 0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe,
+        0x9bdc06a7, 0xc19bf174, 0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f,
+        0x4a7484aa, 0x5cb0a9dc, 0x76f988da, 0x983e5152, 0xa831c66d, 0xb00327c8, 0xbf597fc7,
+        0xc6e00bf3, 0xd5a79147, 0x06ca6351, 0x14292967, 0x27b70a85, 0x2e1b2138, 0x4d2c6dfc,
+        0x53380d13, 0x650a7354, 0x766a0abb, 0x81c2c92e, 0x92722c85, 0xa2bfe8a1, 0xa81a664b,
+        0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070, 0x19a4c116,
+        0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
+        0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7,
+        0xc67178f2};
+    uint32_t w[64], s[8];
+    int t;
+    for (t = 0; t < 16; t++)
+        w[t] = (uint32_t)block[4 * t] << 24 | (uint32_t)block[4 * t + 1] << 16 |
+               (uint32_t)block[4 * t + 2] << 8 | block[4 * t + 3];
+    for (t = 16; t < 64; t++)
+        w[t] = (bf__turn(w[t - 2], 17) ^ bf__turn(w[t - 2], 19) ^ (w[t - 2] >> 10)) + w[t - 7] +
+               (bf__turn(w[t - 15], 7) ^ bf__turn(w[t - 15], 18) ^ (w[t - 15] >> 3)) + w[t - 16];
+    memcpy(s, sha->state, sizeof s);
+    for (t = 0; t < 64; t++) {
+        uint32_t one = s[7] + (bf__turn(s[4], 6) ^ bf__turn(s[4], 11) ^ bf__turn(s[4], 25)) +
+                       ((s[4] & s[5]) ^ (~s[4] & s[6])) + k[t] + w[t];
+        uint32_t two = (bf__turn(s[0], 2) ^ bf__turn(s[0], 13) ^ bf__turn(s[0], 22)) +
+                       ((s[0] & s[1]) ^ (s[0] & s[2]) ^ (s[1] & s[2]));
+        memmove(s + 1, s, 7 * sizeof *s);
+        s[4] += one;
+        s[0] = one + two;
+    }
+    for (t = 0; t < 8; t++) sha->state[t] += s[t];
+}
+
+static void bf__sha_start(bf__sha *sha)
+{
+    static const uint32_t start[8] = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
+                                      0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
+    memcpy(sha->state, start, sizeof start);
+    sha->bytes = 0;
+}
+
+static void bf__sha_add(bf__sha *sha, const void *data, size_t size)
+{
+    const unsigned char *bytes = (const unsigned char *)data;
+    while (size) {
+        size_t used = (size_t)(sha->bytes % 64), part = 64 - used < size ? 64 - used : size;
+        memcpy(sha->block + used, bytes, part);
+        sha->bytes += part;
+        bytes += part;
+        size -= part;
+        if (sha->bytes % 64 == 0) bf__sha_block(sha, sha->block);
+    }
+}
+
+static void bf__sha_end(bf__sha *sha, char text[65])
+{
+    static const unsigned char pad[64] = {0x80};
+    uint64_t bits = 8 * sha->bytes;
+    unsigned char length[8];
+    int n;
+    for (n = 0; n < 8; n++) length[n] = (unsigned char)(bits >> (56 - 8 * n));
+    bf__sha_add(sha, pad, (size_t)(sha->bytes % 64 < 56 ? 56 - sha->bytes % 64 : 120 - sha->bytes % 64));
+    bf__sha_add(sha, length, 8);
+    for (n = 0; n < 32; n++) {
+        unsigned byte = (sha->state[n / 4] >> (24 - 8 * (n % 4))) & 255;
+        text[2 * n] = "0123456789abcdef"[byte >> 4];
+        text[2 * n + 1] = "0123456789abcdef"[byte & 15];
+    }
+    text[64] = 0;
+}
+
+/* ---- files ---- */
+
+/* folder + "/" + name, newly allocated. */
+static char *bf__join(const char *folder, const char *name, size_t length)
+{
+    size_t before = strlen(folder);
+    char *path = (char *)malloc(before + length + 2);
+    if (!path) return NULL;
+    memcpy(path, folder, before);
+    path[before] = '/';
+    memcpy(path + before + 1, name, length);
+    path[before + 1 + length] = 0;
+    return path;
+}
+
+/* A whole small file, newly allocated. */
+static bf_status bf__read(const char *folder, const char *name, char **text, size_t *length)
+{
+    char *path = bf__join(folder, name, strlen(name));
+    FILE *file = path ? fopen(path, "rb") : NULL;
+    size_t room = 0, part = 1;
+    free(path);
+    *text = NULL;
+    *length = 0;
+    if (!file) return BF_CANNOT_READ;
+    while (part) {
+        if (*length == room) {
+            char *more = (char *)realloc(*text, room = 2 * room + 65536);
+            if (!more) break;
+            *text = more;
+        }
+        part = fread(*text + *length, 1, room - *length, file);
+        *length += part;
+    }
+    if (ferror(file) || part) {
+        free(*text);
+        *text = NULL;
+        fclose(file);
+        return part ? BF_NO_MEMORY : BF_CANNOT_READ;
+    }
+    fclose(file);
+    return BF_OK;
+}
+
+/* Size and SHA-256 of a file. */
+static bf_status bf__digest(const char *path, double *size, char sha256[65])
+{
+    unsigned char buffer[8192];
+    FILE *file = fopen(path, "rb");
+    bf__sha sha;
+    size_t part;
+    if (!file) return BF_CANNOT_READ;
+    bf__sha_start(&sha);
+    while ((part = fread(buffer, 1, sizeof buffer, file)) > 0) bf__sha_add(&sha, buffer, part);
+    *size = (double)sha.bytes;
+    bf__sha_end(&sha, sha256);
+    part = (size_t)ferror(file);
+    fclose(file);
+    return part ? BF_CANNOT_READ : BF_OK;
+}
+
+/* A name that stays inside the folder. */
+static int bf__inside(const char *name, size_t length)
+{
+    size_t n;
+    if (length == 0 || name[0] == '/') return 0;
+    for (n = 0; n < length; n++) {
+        if (name[n] == '\\' || (unsigned char)name[n] < 32) return 0;
+        if (name[n] == '.' && n + 1 < length && name[n + 1] == '.') return 0;
+    }
+    return 1;
+}
+
+/* Compare files with the manifest: all of them, or only the one with that name. */
+static bf_status bf__check(const char *folder, const char *only)
+{
+    char *text, sha256[65];
+    const char *key, *digest;
+    size_t length, span, digest_span;
+    int first = 1, inner, checked = 0;
+    bf__json j;
+    bf_status status = bf__read(folder, "manifest.json", &text, &length);
+    if (status != BF_OK) return status == BF_CANNOT_READ ? BF_NOT_A_FIELD : status;
+    j.at = text;
+    j.end = text + length;
+    j.bad = 0;
+    if (!bf__find(&j, "files")) j.bad = 1;
+    while (status == BF_OK && bf__key(&j, &first, &key, &span)) {
+        const char *name = key;
+        size_t name_span = span;
+        double size = -1, found = -2;
+        char *path;
+        digest = NULL;
+        digest_span = 0;
+        for (inner = 1; bf__key(&j, &inner, &key, &span);) {
+            if (bf__is(key, span, "size")) size = bf__number(&j);
+            else if (bf__is(key, span, "sha256")) bf__string(&j, &digest, &digest_span);
+            else bf__skip(&j, 0);
+        }
+        if (j.bad || !bf__inside(name, name_span)) {
+            j.bad = 1;
+            break;
+        }
+        if (only && !bf__is(name, name_span, only)) continue;
+        path = bf__join(folder, name, name_span);
+        if (!path) {
+            status = BF_NO_MEMORY;
+            break;
+        }
+        status = bf__digest(path, &found, sha256);
+        free(path);
+        if (status == BF_OK && found != size) status = BF_WRONG_SIZE;
+        if (status == BF_OK && !bf__is(digest, digest_span, sha256)) status = BF_DAMAGED;
+        checked++;
+    }
+    free(text);
+    if (status != BF_OK) return status;
+    return j.bad || !checked ? BF_NOT_A_FIELD : BF_OK;
+}
+
+bf_status bf_verify(const char *path)
+{
+    bf_field field;
+    bf_status status = bf__check(path, NULL);
+    if (status == BF_OK) status = bf_open(&field, path);
+    if (status == BF_OK) bf_close(&field);
+    return status;
+}
+
+/* One file of exactly that many bytes in memory, read-only. */
+static bf_status bf__map(const char *path, size_t bytes, const float **values)
+{
+#ifdef _WIN32
+    FILE *file = fopen(path, "rb");
+    float *copy = (float *)malloc(bytes);
+    size_t read = 0;
+    if (file && copy) read = fread(copy, 1, bytes, file);
+    if (!file || !copy || read != bytes || fgetc(file) != EOF) {
+        bf_status status = !file ? BF_CANNOT_READ : !copy ? BF_NO_MEMORY : BF_WRONG_SIZE;
+        if (file) fclose(file);
+        free(copy);
+        return status;
+    }
+    fclose(file);
+    *values = copy;
+    return BF_OK;
+#else
+    struct stat about;
+    void *mapped;
+    int file = open(path, O_RDONLY);
+    if (file < 0) return BF_CANNOT_READ;
+    if (fstat(file, &about) != 0 || (uint64_t)about.st_size != (uint64_t)bytes) {
+        close(file);
+        return BF_WRONG_SIZE;
+    }
+    mapped = mmap(NULL, bytes, PROT_READ, MAP_SHARED, file, 0);
+    close(file);
+    if (mapped == MAP_FAILED) return BF_NO_MEMORY;
+    *values = (const float *)mapped;
+    return BF_OK;
+#endif
+}
+
+static void bf__unmap(const float *values, size_t bytes)
+{
+    if (!values) return;
+#ifdef _WIN32
+    (void)bytes;
+    free((void *)values);
+#else
+    munmap((void *)values, bytes);
+#endif
+}
+
+bf_status bf_open(bf_field *field, const char *path)
+{
+    char *text, name[BF_NAME + 64];
+    size_t length;
+    int n, k;
+    bf_status status;
+    memset(field, 0, sizeof *field);
+    status = bf__check(path, "zarr.json");
+    if (status != BF_OK) return status;
+    status = bf__read(path, "zarr.json", &text, &length);
+    if (status != BF_OK) return status;
+    status = bf_describe(field, text, length);
+    free(text);
+    for (n = 0; status == BF_OK && n < field->structures; n++) {
+        bf_structure_part *part = &field->structure[n];
+        part->coefficients = (const float **)calloc((size_t)field->phases, sizeof(float *));
+        if (!part->coefficients) status = BF_NO_MEMORY;
+        for (k = 0; status == BF_OK && k < field->phases; k++) {
+            char *file;
+            snprintf(name, sizeof name, "spline/%s/c/%d/0/0/0", part->name, k);
+            file = bf__join(path, name, strlen(name));
+            status = file ? bf__map(file, field->bytes, &part->coefficients[k]) : BF_NO_MEMORY;
+            free(file);
+        }
+    }
+    if (status != BF_OK) bf_close(field);
+    return status;
+}
+
+bf_status bf_lock(bf_field *field)
+{
+    bf_status status = BF_OK;
+    volatile float sum = 0;
+    int n, k;
+    size_t at;
+    for (n = 0; n < field->structures; n++)
+        for (k = 0; k < field->phases; k++) {
+            const float *values = field->structure[n].coefficients[k];
+            for (at = 0; at < field->bytes / sizeof(float); at += 4096 / sizeof(float))
+                sum = sum + values[at];
+#ifndef _WIN32
+            if (mlock(values, field->bytes) != 0) status = BF_CANNOT_LOCK;
+#endif
+        }
+    return status;
+}
+
+void bf_close(bf_field *field)
+{
+    int n, k;
+    for (n = 0; field->structure && n < field->structures; n++) {
+        for (k = 0; field->structure[n].coefficients && k < field->phases; k++)
+            bf__unmap(field->structure[n].coefficients[k], field->bytes);
+        free((void *)field->structure[n].coefficients);
+    }
+    free(field->structure);
+    free(field->fixture);
+    free(field->phase);
+    free(field->line);
+    memset(field, 0, sizeof *field);
+}
+
+int bf_structure(const bf_field *field, const char *name)
+{
+    int n;
+    for (n = 0; n < field->structures; n++)
+        if (strcmp(field->structure[n].name, name) == 0) return n;
+    return -1;
+}
+
+int bf_fixture(const bf_field *field, const char *name)
+{
+    int n;
+    for (n = 0; n < field->fixtures; n++)
+        if (strcmp(field->fixture[n].name, name) == 0) return n;
+    return -1;
+}
+
+/* ---- queries: no allocation, no system call, nothing written but the answer ---- */
+
+/* Three neighbours on one axis, their weights, and their slopes per step of the grid. */
+static void bf__three(double place, int count, ptrdiff_t index[3], double weight[3], double slope[3])
+{
+    int middle;
+    double t;
+    if (!(place > 0)) place = 0;
+    if (place > count - 1) place = count - 1;
+    middle = (int)(place + 0.5);
+    t = place - middle;
+    weight[0] = 0.5 * (0.5 - t) * (0.5 - t);
+    weight[1] = 0.75 - t * t;
+    weight[2] = 0.5 * (0.5 + t) * (0.5 + t);
+    slope[0] = t - 0.5;
+    slope[1] = -2 * t;
+    slope[2] = t + 0.5;
+    index[0] = middle - 1;
+    index[1] = middle;
+    index[2] = middle + 1;
+    /* Beyond an end the coefficients go on in a straight line: fold the ghost into the others. */
+    if (middle == 0) {
+        weight[1] += 2 * weight[0];
+        weight[2] -= weight[0];
+        slope[1] += 2 * slope[0];
+        slope[2] -= slope[0];
+        weight[0] = slope[0] = 0;
+        index[0] = 0;
+    }
+    if (middle == count - 1) {
+        weight[1] += 2 * weight[2];
+        weight[0] -= weight[2];
+        slope[1] += 2 * slope[2];
+        slope[0] -= slope[2];
+        weight[2] = slope[2] = 0;
+        index[2] = middle;
+    }
+}
+
+static int bf__moment(const bf_field *field, double phase, double weight[3])
+{
+    const double *line = field->line;
+    double first = line[0], turned = phase - floor(phase - first), early, late;
+    int low = 0, high = field->phases;
+    if (turned >= first + 1) turned -= 1;
+    while (high - low > 1) {
+        int middle = (low + high) / 2;
+        if (line[4 * middle] <= turned) low = middle;
+        else high = middle;
+    }
+    early = line[4 * low + 1] - turned;
+    late = turned - line[4 * low];
+    weight[0] = early * early * line[4 * low + 2];
+    weight[2] = late * late * line[4 * low + 3];
+    weight[1] = 1 - weight[0] - weight[2];
+    return low;
+}
+
+/* Distance, and gradient, at a point whose numbers are finite. */
+static double bf__at(const bf_field *field, int structure, const double point_mm[3], double phase,
+                     double gradient[3])
+{
+    const float *const *all = (const float *const *)field->structure[structure].coefficients;
+    const float *p0, *p1, *p2;
+    double time[3], wx[3], wy[3], wz[3], sx[3], sy[3], sz[3], value = 0;
+    ptrdiff_t ix[3], iy[3], iz[3], width = field->shape[0], layer = width * field->shape[1];
+    int b, c, k = bf__moment(field, phase, time);
+    p0 = all[k > 0 ? k - 1 : field->phases - 1];
+    p1 = all[k];
+    p2 = all[k + 1 < field->phases ? k + 1 : 0];
+    bf__three((point_mm[0] - field->origin_mm[0]) / field->spacing_mm[0], field->shape[0], ix, wx, sx);
+    bf__three((point_mm[1] - field->origin_mm[1]) / field->spacing_mm[1], field->shape[1], iy, wy, sy);
+    bf__three((point_mm[2] - field->origin_mm[2]) / field->spacing_mm[2], field->shape[2], iz, wz, sz);
+    gradient[0] = gradient[1] = gradient[2] = 0;
+    for (c = 0; c < 3; c++) {
+        double plane = 0, plane_x = 0, plane_y = 0;
+        for (b = 0; b < 3; b++) {
+            ptrdiff_t row = iz[c] * layer + iy[b] * width;
+            double n0 = time[0] * p0[row + ix[0]] + time[1] * p1[row + ix[0]] + time[2] * p2[row + ix[0]];
+            double n1 = time[0] * p0[row + ix[1]] + time[1] * p1[row + ix[1]] + time[2] * p2[row + ix[1]];
+            double n2 = time[0] * p0[row + ix[2]] + time[1] * p1[row + ix[2]] + time[2] * p2[row + ix[2]];
+            double line = wx[0] * n0 + wx[1] * n1 + wx[2] * n2;
+            plane += wy[b] * line;
+            plane_x += wy[b] * (sx[0] * n0 + sx[1] * n1 + sx[2] * n2);
+            plane_y += sy[b] * line;
+        }
+        value += wz[c] * plane;
+        gradient[0] += wz[c] * plane_x;
+        gradient[1] += wz[c] * plane_y;
+        gradient[2] += sz[c] * plane;
+    }
+    gradient[0] /= field->spacing_mm[0];
+    gradient[1] /= field->spacing_mm[1];
+    gradient[2] /= field->spacing_mm[2];
+    return value;
+}
+
+static double bf__height(const bf_fixture_part *law, double distance_mm)
+{
+    double q = law->side == 0 ? fabs(distance_mm) : law->side * distance_mm, s, power = 1;
+    int m = law->m;
+    if (q <= 0) return 0;
+    s = q * q / (2 * law->delta_mm * law->delta_mm);
+    for (; m; m >>= 1, s *= s)
+        if (m & 1) power *= s;
+    return -expm1(-power);
+}
+
+static void bf__force_at(const bf_field *field, const bf_fixture_part *law, const double point_mm[3],
+                         double phase, double force_n[3])
+{
+    double gradient[3], length, scale;
+    double distance = bf__at(field, law->structure, point_mm, phase, gradient);
+    length = sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1] + gradient[2] * gradient[2]);
+    scale = -law->f_max_n * bf__height(law, distance) / (length > 0.5 ? length : 0.5);
+    if (law->side == 0 ? distance < 0 : law->side < 0) scale = -scale;
+    force_n[0] = scale * gradient[0];
+    force_n[1] = scale * gradient[1];
+    force_n[2] = scale * gradient[2];
+}
+
+static int bf__finite(const double point_mm[3], double phase)
+{
+    /* Not a number and infinity both fail this, and so does the sum of huge numbers. */
+    double sum = point_mm[0] + point_mm[1] + point_mm[2] + phase;
+    return sum - sum == 0;
+}
+
+bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
+                      double *distance_mm, double gradient[3])
+{
+    double slope[3], distance;
+    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
+    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
+    distance = bf__at(field, structure, point_mm, phase, slope);
+    if (distance_mm) *distance_mm = distance;
+    if (gradient) memcpy(gradient, slope, sizeof slope);
+    return BF_OK;
+}
+
+bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
+                       double *potential)
+{
+    double slope[3];
+    const bf_fixture_part *law;
+    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
+    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
+    law = &field->fixture[fixture];
+    *potential = bf__height(law, bf__at(field, law->structure, point_mm, phase, slope));
+    return BF_OK;
+}
+
+bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
+                   double force_n[3])
+{
+    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
+    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
+    bf__force_at(field, &field->fixture[fixture], point_mm, phase, force_n);
+    return BF_OK;
+}
+
+bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
+                    const double *phases, size_t phase_count, double *forces_n)
+{
+    size_t n;
+    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
+    if (phase_count != 1 && phase_count != count) return BF_WRONG_SIZE;
+    for (n = 0; n < count; n++)
+        if (!bf__finite(points_mm + 3 * n, phases[phase_count == 1 ? 0 : n])) return BF_NOT_FINITE;
+    for (n = 0; n < count; n++)
+        bf__force_at(field, &field->fixture[fixture], points_mm + 3 * n,
+                     phases[phase_count == 1 ? 0 : n], forces_n + 3 * n);
+    return BF_OK;
+}
+
+void bf_transform(const double t[16], const double point_mm[3], double moved_mm[3])
+{
+    double x = point_mm[0], y = point_mm[1], z = point_mm[2];
+    moved_mm[0] = t[0] * x + t[1] * y + t[2] * z + t[3];
+    moved_mm[1] = t[4] * x + t[5] * y + t[6] * z + t[7];
+    moved_mm[2] = t[8] * x + t[9] * y + t[10] * z + t[11];
+}
+
+/* ---- whole tools ---- */
+
+typedef struct {
+    const bf_field *field;
+    const bf_fixture_part *law;
+    const bf_tool *tool;
+    const double *mr_from_tool;
+    double phase, bound_n, longest_mm, force_n[3], torque_nmm[3];
+    int pieces, piece, evaluations;
+    double piece_start_mm, piece_length_mm; /* of the piece that was asked for last */
+} bf__walk;
+
+enum { BF__HALVINGS = 12 };
+
+static double bf__length(const bf_tool *tool, int piece)
+{
+    const double *a = tool->points_mm + 3 * (size_t)piece;
+    const double *b = tool->points_mm + 3 * (size_t)((piece + 1) % tool->count);
+    double x = b[0] - a[0], y = b[1] - a[1], z = b[2] - a[2];
+    return sqrt(x * x + y * y + z * z);
+}
+
+/* Point of the tool at a length along it, in the tool's frame. Places asked for one after the other
+ * are near each other, so the piece that holds one is a step or two from the last. */
+static void bf__point(bf__walk *walk, double along_mm, double point_mm[3])
+{
+    const double *a, *b;
+    double share;
+    int axis;
+    while (along_mm > walk->piece_start_mm + walk->piece_length_mm && walk->piece + 1 < walk->pieces) {
+        walk->piece_start_mm += walk->piece_length_mm;
+        walk->piece_length_mm = bf__length(walk->tool, ++walk->piece);
+    }
+    while (along_mm < walk->piece_start_mm && walk->piece > 0) {
+        walk->piece_length_mm = bf__length(walk->tool, --walk->piece);
+        walk->piece_start_mm -= walk->piece_length_mm;
+    }
+    a = walk->tool->points_mm + 3 * (size_t)walk->piece;
+    b = walk->tool->points_mm + 3 * (size_t)((walk->piece + 1) % walk->tool->count);
+    share = walk->piece_length_mm > 0 ? (along_mm - walk->piece_start_mm) / walk->piece_length_mm : 0;
+    for (axis = 0; axis < 3; axis++) point_mm[axis] = a[axis] + share * (b[axis] - a[axis]);
+}
+
+typedef struct {
+    double point_mm[3]; /* in the tool's frame */
+    double force_n[3];  /* in the MR frame */
+    double distance_mm;
+} bf__feel;
+
+static void bf__ask(bf__walk *walk, double along_mm, bf__feel *feel)
+{
+    double moved[3], gradient[3], length, scale;
+    const bf_fixture_part *law = walk->law;
+    bf__point(walk, along_mm, feel->point_mm);
+    bf_transform(walk->mr_from_tool, feel->point_mm, moved);
+    feel->distance_mm = bf__at(walk->field, law->structure, moved, walk->phase, gradient);
+    length = sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1] + gradient[2] * gradient[2]);
+    scale = -law->f_max_n * bf__height(law, feel->distance_mm) / (length > 0.5 ? length : 0.5);
+    if (law->side == 0 ? feel->distance_mm < 0 : law->side < 0) scale = -scale;
+    feel->force_n[0] = scale * gradient[0];
+    feel->force_n[1] = scale * gradient[1];
+    feel->force_n[2] = scale * gradient[2];
+    walk->evaluations++;
+}
+
+static void bf__add(bf__walk *walk, const bf__feel *feel, double weight)
+{
+    double arm[3], lever[3];
+    const double *t = walk->mr_from_tool, *f = feel->force_n;
+    int axis;
+    for (axis = 0; axis < 3; axis++) arm[axis] = feel->point_mm[axis] - walk->tool->handle_mm[axis];
+    for (axis = 0; axis < 3; axis++)
+        lever[axis] = t[4 * axis] * arm[0] + t[4 * axis + 1] * arm[1] + t[4 * axis + 2] * arm[2];
+    for (axis = 0; axis < 3; axis++) walk->force_n[axis] += weight * f[axis];
+    walk->torque_nmm[0] += weight * (lever[1] * f[2] - lever[2] * f[1]);
+    walk->torque_nmm[1] += weight * (lever[2] * f[0] - lever[0] * f[2]);
+    walk->torque_nmm[2] += weight * (lever[0] * f[1] - lever[1] * f[0]);
+}
+
+/* The stretch of the given length about a middle that has been asked already. The distance changes
+ * by no more than the way: where even the least distance on the stretch gives a force below the
+ * bound, the middle speaks for all of it. */
+static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, double share,
+                        const bf__feel *middle, int depth)
+{
+    bf__feel left, right;
+    double way = 0.5 * length_mm, reach, off = 0;
+    int axis;
+    reach = walk->law->side == 0 ? fabs(middle->distance_mm) : walk->law->side * middle->distance_mm;
+    if (2 * walk->law->f_max_n * bf__height(walk->law, walk->law->side < 0 ? -(reach + way) : reach + way) <=
+        walk->bound_n) {
+        bf__add(walk, middle, share);
+        return;
+    }
+    bf__ask(walk, middle_mm - way / 2, &left);
+    bf__ask(walk, middle_mm + way / 2, &right);
+    for (axis = 0; axis < 3; axis++) {
+        double change = 0.5 * (left.force_n[axis] + right.force_n[axis]) - middle->force_n[axis];
+        off += change * change;
+    }
+    /* The midpoint rule errs by about four thirds of the change that halving makes, Simpson's
+     * combination of both by far less: the change itself is a bound with room to spare. */
+    if ((length_mm <= walk->longest_mm && off <= walk->bound_n * walk->bound_n) || depth == BF__HALVINGS) {
+        bf__add(walk, &left, share * 2 / 3);
+        bf__add(walk, &right, share * 2 / 3);
+        bf__add(walk, middle, -share / 3);
+        return;
+    }
+    bf__stretch(walk, middle_mm - way / 2, way, share / 2, &left, depth + 1);
+    bf__stretch(walk, middle_mm + way / 2, way, share / 2, &right, depth + 1);
+}
+
+bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
+                        const double mr_from_tool[16], double phase, double bound_n,
+                        double force_n[3], double torque_nmm[3], int *evaluations)
+{
+    bf__walk walk;
+    bf__feel feel;
+    double total = 0, length;
+    int n, stretches;
+    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
+    if (tool->count < 1) return BF_WRONG_SIZE;
+    if (!(bound_n > 0) || phase - phase != 0) return BF_NOT_FINITE;
+    for (n = 0; n < 12; n++)
+        if (mr_from_tool[n] - mr_from_tool[n] != 0) return BF_NOT_FINITE;
+    memset(&walk, 0, sizeof walk);
+    walk.field = field;
+    walk.law = &field->fixture[fixture];
+    walk.tool = tool;
+    walk.mr_from_tool = mr_from_tool;
+    walk.phase = phase;
+    walk.bound_n = bound_n;
+    walk.pieces = tool->closed ? tool->count : tool->count - 1;
+    for (n = 0; n < walk.pieces; n++) total += bf__length(tool, n);
+    if (total - total != 0) return BF_NOT_FINITE;
+    walk.longest_mm = field->spacing_mm[0];
+    for (n = 1; n < 3; n++)
+        if (field->spacing_mm[n] < walk.longest_mm) walk.longest_mm = field->spacing_mm[n];
+    /* Curvature of the spline changes from node to node: longer stretches could step over it. */
+    walk.longest_mm *= 2;
+    if (walk.pieces) walk.piece_length_mm = bf__length(tool, 0);
+    length = 4 * walk.longest_mm;
+    stretches = total > length ? (int)ceil(total / length < 1e6 ? total / length : 1e6) : 1;
+    for (n = 0; n < stretches; n++) {
+        double middle = (n + 0.5) * total / stretches;
+        bf__ask(&walk, middle, &feel);
+        if (total > 0) bf__stretch(&walk, middle, total / stretches, 1.0 / stretches, &feel, 0);
+        else bf__add(&walk, &feel, 1);
+    }
+    memcpy(force_n, walk.force_n, sizeof walk.force_n);
+    if (torque_nmm) memcpy(torque_nmm, walk.torque_nmm, sizeof walk.torque_nmm);
+    if (evaluations) *evaluations = walk.evaluations;
+    return BF_OK;
+}
+#endif /* BEATFIELD_IMPLEMENTATION */

@@ -1,0 +1,278 @@
+"""The C header: compiled without a warning, the same answers as Python, and damage survived."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from field_baked import FIXTURES, bake_small
+from scipy.spatial.transform import Rotation
+
+from pipeline.field import ForceField, get_include
+from pipeline.field.manifest import write_manifest
+
+HERE = Path(__file__).parent
+EXAMPLE = HERE.parent / "docs" / "examples" / "query.c"
+STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+SANITIZE = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+
+
+def build(source: Path, target: Path, *options: str, compiler: str = "gcc") -> Path:
+    command = [compiler, "-O2", *STRICT, *options, f"-I{get_include()}"]
+    language = ["-x", "c++" if compiler == "g++" else "c"]
+    subprocess.run([*command, *language, str(source), "-o", str(target), "-lm"], check=True)
+    return target
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("header") / "field.zarr"
+    bake_small(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    return build(HERE / "field_driver.c", tmp_path_factory.mktemp("c") / "driver", "-std=c99")
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory):
+    """The same program, watched by the address and undefined-behaviour sanitizers."""
+    target = tmp_path_factory.mktemp("c") / "watched"
+    return build(HERE / "field_driver.c", target, "-std=c99", *SANITIZE)
+
+
+def run(program, *words, given=b"", **environment):
+    return subprocess.run(
+        [program, *map(str, words)],
+        input=given,
+        capture_output=True,
+        env={**os.environ, **environment},
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("compiler", "standard"), [("gcc", "-std=c99"), ("gcc", "-std=c11"), ("g++", "-std=c++11")]
+)
+@pytest.mark.parametrize("source", [EXAMPLE, HERE / "field_driver.c"])
+def test_compiles_without_a_warning(tmp_path, compiler, standard, source):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}")
+    build(source, tmp_path / "program", standard, compiler=compiler)
+
+
+def test_a_million_answers_are_pythons(path, program):
+    field = ForceField.open(path)
+    rng = np.random.default_rng(0)
+    # Beyond the grid too, and phases of other beats.
+    questions = np.column_stack(
+        [rng.uniform(-60, 60, (1_000_000 // 3, 3)), rng.uniform(-1, 2, 1_000_000 // 3)]
+    )
+    done = run(program, path, given=questions.tobytes())
+    assert done.returncode == 0
+    answers = np.frombuffer(done.stdout).reshape(len(questions), len(FIXTURES), 8)
+    points, phases = questions[:, :3], questions[:, 3]
+    for number, (name, law) in enumerate(FIXTURES.items()):
+        found = answers[:, number]
+        expected = np.column_stack(
+            [
+                field.force_n(points, phases, name),
+                field.distance_mm(points, phases, law.structure),
+                field.gradient(points, phases, law.structure),
+                field.potential(points, phases, name),
+            ]
+        )
+        # Relative to the largest of each, for differences of near equal numbers lose digits.
+        scale = np.abs(expected).max(axis=0)
+        assert (np.abs(found - expected) <= 1e-12 * scale).all()
+
+
+def test_example_prints_what_query_says(path, tmp_path):
+    program = build(EXAMPLE, tmp_path / "query")
+    field = ForceField.open(path)
+    point, phase = (14.0, -3.5, 6.25), 0.37
+
+    lines = run(program, path, *point, phase).stdout.decode().splitlines()
+
+    assert [line.split(":")[0] for line in lines] == list(FIXTURES)
+    for line, name in zip(lines, FIXTURES, strict=True):
+        said = [float(word) for word in line.split("force ")[1].split()[:3]]
+        np.testing.assert_allclose(said, field.force_n([point], phase, name)[0], rtol=1e-8)
+    assert run(program, path.parent / "none", *point, phase).returncode == 2
+
+
+@pytest.mark.parametrize("word", ["refuse", "lock"])
+def test_wrong_questions_have_codes(path, watched, word):
+    done = run(watched, path, word)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_comma_for_a_point_in_the_locale_does_not_matter(path, program):
+    question = np.array([10.0, 5, 3, 0.4]).tobytes()
+    plain = run(program, path, given=question, LC_ALL="C").stdout
+    assert run(program, path, given=question, LC_ALL="de_DE.UTF-8").stdout == plain
+
+
+def test_sanitizers_find_nothing_at_the_borders(path, watched):
+    field = ForceField.open(path)
+    low, high = np.array(field.grid.origin_mm), field.grid.upper_mm
+    corners = np.array(np.meshgrid(*np.stack([low, high], axis=1))).reshape(3, -1).T
+    near = np.concatenate([corners, corners - 1e-9, corners + 1e-9, 1e9 * corners])
+    phases = np.array([0, 1 - 2**-53, -1e-300, 0.05, 1e6, -1e6])
+    questions = np.column_stack([np.tile(near, (6, 1)), np.repeat(phases, len(near))])
+    done = run(watched, path, given=questions.tobytes())
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert np.isfinite(np.frombuffer(done.stdout)).all()
+
+
+def ring(radius_mm: float, count: int) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(count) / count
+    return radius_mm * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+
+
+TOOLS = {
+    "torus": (ring(10, 48), True),
+    "needle": (np.array([[0.0, 0, 0], [0, 0, 60]]), False),
+    "bent": (np.array([[-20.0, 0, 0], [0, 5, 0], [0, 5, 0], [3, 5, 25], [3, 5, 26]]), False),
+    "point": (np.array([[1.0, 2, 3]]), False),
+}
+
+
+@pytest.mark.parametrize("bound", [0.05, 0.005])
+@pytest.mark.parametrize("name", TOOLS)
+def test_force_on_a_tool_keeps_its_bound(path, watched, name, bound):
+    """Against the plain mean over 100,000 points along the tool, through medial axes too."""
+    line, closed = TOOLS[name]
+    field = ForceField.open(path)
+    rng = np.random.default_rng(5)
+    poses = []
+    for _ in range(12):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform(-20, 20, 3)
+        poses.append(np.append(pose.ravel(), rng.uniform()))
+    given = line.tobytes() + np.concatenate(poses).tobytes()
+
+    done = run(watched, path, "tool", bound, len(line), int(closed), given=given)
+
+    assert (done.returncode, done.stderr) == (0, b"")
+    answers = np.frombuffer(done.stdout).reshape(len(poses), len(FIXTURES), 7)
+    along = points_along(line, closed, 100_000)
+    for pose, answer in zip(poses, answers, strict=True):
+        matrix = pose[:16].reshape(4, 4)
+        points = along @ matrix[:3, :3].T + matrix[:3, 3]
+        levers = (along - (0, 0, 100)) @ matrix[:3, :3].T
+        for fixture, found in zip(FIXTURES, answer, strict=True):
+            forces = field.force_n(points, pose[16], fixture)
+            assert np.linalg.norm(found[:3] - forces.mean(axis=0)) <= bound
+            torque = np.cross(levers, forces).mean(axis=0)
+            assert (
+                np.linalg.norm(found[3:6] - torque) <= bound * np.linalg.norm(levers, axis=1).max()
+            )
+            # Far fewer questions than the sum.
+            assert found[6] < 2000
+
+
+def points_along(line, closed, count):
+    """Evenly spaced points along straight pieces, each the middle of its share."""
+    ends = np.concatenate([line, line[:1]]) if closed else line
+    lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+    if len(lengths) == 0 or lengths.sum() == 0:
+        return np.repeat(line[:1], count, axis=0)
+    start = np.concatenate([[0], np.cumsum(lengths)])
+    keep = np.concatenate([[True], lengths > 0])
+    place = (np.arange(count) + 0.5) / count * start[-1]
+    return np.column_stack([np.interp(place, start[keep], ends[keep][:, k]) for k in range(3)])
+
+
+def damaged(path, target, change):
+    shutil.copytree(path, target)
+    change(target)
+    return target
+
+
+def cut(file, size):
+    os.truncate(file, size)
+
+
+DAMAGE = {
+    "no manifest": lambda f: (f / "manifest.json").unlink(),
+    "empty manifest": lambda f: cut(f / "manifest.json", 0),
+    "cut manifest": lambda f: cut(f / "manifest.json", 300),
+    "cut description": lambda f: cut(f / "zarr.json", 500),
+    "no coefficients": lambda f: (f / "spline/ball/c/2/0/0/0").unlink(),
+    "short coefficients": lambda f: cut(f / "spline/ball/c/2/0/0/0", 100),
+    "a folder for a file": lambda f: (
+        (f / "spline/ball/c/2/0/0/0").unlink(),
+        (f / "spline/ball/c/2/0/0/0").mkdir(),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_damage_is_refused(path, watched, tmp_path, kind):
+    broken = damaged(path, tmp_path / "f.zarr", DAMAGE[kind])
+    done = run(watched, broken)
+    assert 0 < done.returncode < 9
+    assert done.stderr == b""
+
+
+def test_verify_finds_a_flipped_bit(path, watched, tmp_path):
+    assert run(watched, path, "verify").stdout == b"done\n"
+
+    def flip(folder):
+        file = folder / "potential/guide/c/1/0/0/0"
+        content = bytearray(file.read_bytes())
+        content[1234] ^= 1
+        file.write_bytes(content)
+
+    done = run(watched, damaged(path, tmp_path / "f.zarr", flip), "verify")
+    assert b"not what the manifest says" in done.stdout
+
+
+def test_any_description_is_survived(path, watched, tmp_path):
+    """Descriptions with bytes changed, cut or doubled at random, sealed anew so that they are
+    parsed: refused or understood, never a fault that a sanitizer sees."""
+    chance = random.Random(0)  # no secret depends on it
+    text = (path / "zarr.json").read_bytes()
+    start = text.index(b'"beatfield"')
+    folder = damaged(path, tmp_path / "f.zarr", lambda f: None)
+    for _ in range(60):
+        content = bytearray(text)
+        for _ in range(chance.randint(1, 4)):
+            at = chance.randrange(start, len(content) - 20)
+            kind = chance.randrange(3)
+            if kind == 0:
+                content[at] = chance.choice(b'{}[],:"0123456789-.e\\ntx')
+            elif kind == 1:
+                del content[at : at + chance.randint(1, 30)]
+            else:
+                content[at:at] = content[at : at + chance.randint(1, 30)]
+        (folder / "zarr.json").write_bytes(content)
+        (folder / "manifest.json").unlink(missing_ok=True)
+        write_manifest(folder)
+        done = run(watched, folder, given=np.zeros(4).tobytes())
+        assert 0 <= done.returncode < 9
+        assert done.stderr == b""
+
+
+def test_metadata_is_understood_whatever_the_order_of_its_keys(path, program, tmp_path):
+    def reorder(folder):
+        content = json.loads((folder / "zarr.json").read_text())
+        field = content["attributes"]["beatfield"]
+        content["attributes"]["beatfield"] = dict(sorted(field.items()))
+        (folder / "zarr.json").write_text(json.dumps(content))
+        (folder / "manifest.json").unlink()
+        write_manifest(folder)
+
+    question = np.array([10.0, 5, 3, 0.4]).tobytes()
+    other = damaged(path, tmp_path / "f.zarr", reorder)
+    assert run(program, other, given=question).stdout == run(program, path, given=question).stdout
