@@ -43,6 +43,19 @@ static int feel(const bf_field *field, double bound_n, int count, int closed)
     return failed;
 }
 
+/* FIELD tank LEVEL CAPACITY: point and wanted force -> rendered force and level */
+static int tank(double level_mj, double capacity_mj)
+{
+    double q[6];
+    bf_tank held = bf_full_tank(level_mj, capacity_mj);
+    while (fread(q, sizeof(double), 6, stdin) == 6) {
+        bf_pass(&held, q, q + 3);
+        fwrite(q + 3, sizeof(double), 3, stdout);
+        fwrite(&held.level_mj, sizeof(double), 1, stdout);
+    }
+    return 0;
+}
+
 static int refuse(const bf_field *field)
 {
     double point[3] = {0, 0, 0}, bad[3] = {0, NAN, 0}, force[3], phases[2] = {0, 0};
@@ -76,6 +89,7 @@ int main(int count, char **words)
         return (int)status;
     }
     if (count > 5) failed = feel(&field, atof(words[3]), atoi(words[4]), atoi(words[5]));
+    else if (count > 4) failed = tank(atof(words[3]), atof(words[4]));
     else if (count > 2 && strcmp(words[2], "refuse") == 0) failed = refuse(&field);
     else if (count > 2 && strcmp(words[2], "lock") == 0) failed = bf_lock(&field) == BF_CANNOT_READ;
     else failed = ask(&field);

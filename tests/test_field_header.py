@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.field import ForceField, get_include
 from pipeline.field.manifest import write_manifest
+from pipeline.field.passivity import EnergyTank
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "docs" / "examples" / "query.c"
@@ -179,6 +180,21 @@ def test_force_on_a_tool_keeps_its_bound(path, watched, name, bound):
             )
             # Far fewer questions than the sum.
             assert found[6] < 2000
+
+
+def test_the_energy_tank_is_pythons(path, watched):
+    rng = np.random.default_rng(2)
+    points = np.cumsum(rng.normal(scale=0.3, size=(2000, 3)), axis=0)
+    forces = rng.normal(scale=1.5, size=(2000, 3))
+    tank = EnergyTank(3.0, 8.0)
+    expected = [(*tank.passed(p, f), tank.level_mj) for p, f in zip(points, forces, strict=True)]
+
+    done = run(watched, path, "tank", 3.0, 8.0, given=np.column_stack([points, forces]).tobytes())
+
+    found = np.frombuffer(done.stdout).reshape(-1, 4)
+    # The tank's level adds up 2000 roundings of a few millijoules.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert (found[:, 3] < 0).any()
 
 
 def points_along(line, closed, count):

@@ -135,6 +135,24 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
 
+/* A moving fixture can push energy into the hand. A tank lets through only what it holds: energy
+ * that the hand gives fills it, energy that the hand gets drains it, and where it is empty the part
+ * of the force that would drive the motion on is withheld. Off unless it is used:
+ *
+ *     bf_tank tank = bf_full_tank(5, 20);               5 mJ to begin with, 20 mJ at most
+ *     each tick: bf_force(...); bf_pass(&tank, point_mm, force_n);
+ */
+typedef struct {
+    double level_mj, capacity_mj;
+    double point_mm[3], force_n[3]; /* of the last tick */
+    int started;
+} bf_tank;
+
+bf_tank bf_full_tank(double level_mj, double capacity_mj);
+
+/* What may be rendered of a force, in place, at the tool's present point. */
+void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3]);
+
 /* target = transform * point; the arrays may be the same. */
 void bf_transform(const double transform[16], const double point_mm[3], double moved_mm[3]);
 
@@ -1262,5 +1280,49 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (torque_nmm) memcpy(torque_nmm, walk.torque_nmm, sizeof walk.torque_nmm);
     if (evaluations) *evaluations = walk.evaluations;
     return BF_OK;
+}
+
+/* ---- energy ---- */
+
+bf_tank bf_full_tank(double level_mj, double capacity_mj)
+{
+    bf_tank tank;
+    memset(&tank, 0, sizeof tank);
+    tank.level_mj = level_mj;
+    tank.capacity_mj = capacity_mj;
+    return tank;
+}
+
+void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
+{
+    double way[3], way2 = 0, work = 0, ahead = 0, allowed, share;
+    int axis;
+    if (!tank->started) {
+        memcpy(tank->point_mm, point_mm, sizeof tank->point_mm);
+        tank->started = 1;
+    }
+    for (axis = 0; axis < 3; axis++) {
+        way[axis] = point_mm[axis] - tank->point_mm[axis];
+        way2 += way[axis] * way[axis];
+        work += tank->force_n[axis] * way[axis];
+        ahead += force_n[axis] * way[axis];
+    }
+    /* What the force held since the last tick has really done: newtons times mm are millijoules. */
+    tank->level_mj -= work;
+    if (tank->level_mj > tank->capacity_mj) tank->level_mj = tank->capacity_mj;
+    allowed = tank->level_mj > 0 ? tank->level_mj : 0;
+    /* The next step will be much like the last. In debt, only force against the motion is left. */
+    if (way2 > 0 && (ahead > allowed || tank->level_mj < 0)) {
+        share = (ahead > allowed ? allowed : ahead) / way2;
+        for (axis = 0; axis < 3; axis++) {
+            double along = ahead / way2 * way[axis];
+            double across = tank->level_mj < 0 ? 0 : force_n[axis] - along;
+            force_n[axis] = across + share * way[axis];
+        }
+    } else if (tank->level_mj < 0) {
+        force_n[0] = force_n[1] = force_n[2] = 0;
+    }
+    memcpy(tank->point_mm, point_mm, sizeof tank->point_mm);
+    memcpy(tank->force_n, force_n, sizeof tank->force_n);
 }
 #endif /* BEATFIELD_IMPLEMENTATION */

@@ -1,0 +1,67 @@
+"""An energy tank that keeps a moving fixture from driving the hand.
+
+A field at rest gives back no more energy than was put into it; a beating one can push. The tank is
+a passivity observer with a budget: Hannaford and Ryu, IEEE Trans. Robot. Autom. 18(1):1-10, 2002;
+tanks after Franken et al., IEEE Trans. Robot. 27(4):741-756, 2011. Newtons times millimetres are
+millijoules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pipeline.errors import InputError
+
+Triple = tuple[float, float, float]
+
+
+class EnergyTank:
+    """What may be rendered of a force, tick by tick.
+
+    Energy that the hand gives fills the tank, up to its capacity; energy that the hand gets drains
+    it; where it is empty, the part of the force that would drive the motion on is withheld. So
+    the hand never gets more than the tank held at first, but for one tick's step that could not be
+    foreseen. ``bf_pass`` of the C header is the same.
+
+    Raises
+    ------
+    InputError
+        When a level is negative, or above the capacity.
+    """
+
+    def __init__(self, level_mj: float = 5.0, capacity_mj: float = 20.0) -> None:
+        if not 0 <= level_mj <= capacity_mj:
+            raise InputError(
+                f"energy tank: a level of {level_mj:g} mJ in a capacity of {capacity_mj:g} mJ; "
+                "needs 0 <= level_mj <= capacity_mj"
+            )
+        self.level_mj = level_mj
+        self._capacity_mj = capacity_mj
+        self._point_mm: Sequence[float] | None = None
+        self._force_n: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def passed(self, point_mm: Sequence[float], force_n: Sequence[float]) -> Triple:
+        """The force to render at the tool's present point, of the one that the field wants."""
+        last = self._point_mm if self._point_mm is not None else point_mm
+        way = [now - before for now, before in zip(point_mm, last, strict=True)]
+        way2 = _dot(way, way)
+        # What the force held since the last tick has really done.
+        self.level_mj = min(self.level_mj - _dot(self._force_n, way), self._capacity_mj)
+        ahead, allowed = _dot(force_n, way), max(self.level_mj, 0.0)
+        x, y, z = force_n
+        if way2 > 0 and (ahead > allowed or self.level_mj < 0):
+            # The next step will be much like the last. In debt, only force against the motion is
+            # left.
+            along, kept = ahead / way2, min(ahead, allowed) / way2
+            across = 0.0 if self.level_mj < 0 else 1.0
+            x, y, z = (
+                across * (f - along * w) + kept * w for f, w in zip(force_n, way, strict=True)
+            )
+        elif self.level_mj < 0:
+            x = y = z = 0.0
+        self._point_mm, self._force_n = tuple(point_mm), (x, y, z)
+        return x, y, z
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
