@@ -15,7 +15,7 @@ from pipeline.errors import InputError
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
 from pipeline.field.certificate import points_about, vtk_distance
-from pipeline.field.kernels import largest_change, largest_steps
+from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.store import verify_field
 from pipeline.geometry import MovingSurface
 from pipeline.own_surfaces import bake_own_surfaces

@@ -182,7 +182,7 @@ class _ForceSteps:
 
     def add(self, index: int) -> None:
         """Measure phase ``index``, and the change to it from the phase before."""
-        from pipeline.field.kernels import largest_change, largest_steps
+        from pipeline.field.steps import largest_change, largest_steps
 
         force_n = self._forces(index)
         steps_n = np.empty((2, 3))
@@ -202,7 +202,7 @@ class _ForceSteps:
 
     def result(self) -> dict[str, Any]:
         """The largest steps over space and, the cycle closed, over time."""
-        from pipeline.field.kernels import largest_change
+        from pipeline.field.steps import largest_change
 
         changes_n = [*self._changes_n, float(largest_change(self._before_n, self._first_n))]
         phases, rr_s = self._volume.phases, self._volume.rr_s

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic, register_jitable
 
@@ -194,44 +195,146 @@ def sample_force(addresses, line, grid, side, delta_mm, m, f_max_n, points_mm, p
         force_n[n, 0], force_n[n, 1], force_n[n, 2] = fx, fy, fz
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
-def largest_steps(force_n, distance_mm, near_mm, steps_n):  # type: ignore[no-untyped-def]
-    """Largest force step between neighbouring nodes, into ``steps_n`` ``(2, 3)``.
+HALVINGS = 12
+"""A stretch of a tool is halved no more often than this."""
 
-    Per axis ``x, y, z``: row 0 over all nodes, row 1 over pairs both within ``near_mm`` of the
-    surface.
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
+    """Point of a tool at a length along it, into ``feel[:3]``.
+
+    ``walk`` holds the piece that was asked for last, its start and length: places asked for one
+    after the other are near each other. A closed line repeats its first point.
     """
+    pieces = len(line_mm) - 1
+    piece, start, length = int(walk[0]), walk[1], walk[2]
+    while along > start + length and piece + 1 < pieces:
+        start += length
+        piece += 1
+        length = _piece_length(line_mm, piece)
+    while along < start and piece > 0:
+        piece -= 1
+        length = _piece_length(line_mm, piece)
+        start -= length
+    walk[0], walk[1], walk[2] = piece, start, length
+    share = (along - start) / length if length > 0 else 0.0
+    end = piece + 1 if pieces > 0 else piece
     for axis in range(3):
-        steps_n[0, axis] = steps_n[1, axis] = 0.0
-    shape = distance_mm.shape
-    for k in range(shape[0]):
-        for j in range(shape[1]):
-            for i in range(shape[2]):
-                near = abs(distance_mm[k, j, i]) <= near_mm
-                for axis in range(3):
-                    k1, j1, i1 = k + (axis == 2), j + (axis == 1), i + (axis == 0)
-                    if k1 == shape[0] or j1 == shape[1] or i1 == shape[2]:
-                        continue
-                    step2 = 0.0
-                    for part in range(3):
-                        step2 += (force_n[k1, j1, i1, part] - force_n[k, j, i, part]) ** 2
-                    steps_n[0, axis] = max(steps_n[0, axis], step2)
-                    if near and abs(distance_mm[k1, j1, i1]) <= near_mm:
-                        steps_n[1, axis] = max(steps_n[1, axis], step2)
-    for axis in range(3):
-        steps_n[0, axis] = math.sqrt(steps_n[0, axis])
-        steps_n[1, axis] = math.sqrt(steps_n[1, axis])
+        feel[axis] = line_mm[piece, axis] + share * (line_mm[end, axis] - line_mm[piece, axis])
 
 
 @njit(nogil=True, cache=True, fastmath=CONTRACT)
-def largest_change(before_n, after_n):  # type: ignore[no-untyped-def]
-    """Largest change of force at a node between two phases, newtons."""
-    largest = 0.0
-    for k in range(before_n.shape[0]):
-        for j in range(before_n.shape[1]):
-            for i in range(before_n.shape[2]):
-                change2 = 0.0
-                for part in range(3):
-                    change2 += (after_n[k, j, i, part] - before_n[k, j, i, part]) ** 2
-                largest = max(largest, change2)
-    return math.sqrt(largest)
+def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
+    x = line_mm[piece + 1, 0] - line_mm[piece, 0]
+    y = line_mm[piece + 1, 1] - line_mm[piece, 1]
+    z = line_mm[piece + 1, 2] - line_mm[piece, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-untyped-def]
+    """Ask at a length along a tool: its point, the force and the distance into ``feel``."""
+    addresses, line, grid, side, delta_mm, m, f_max_n = law
+    _on_tool(line_mm, along, walk, feel)
+    x = pose[0, 0] * feel[0] + pose[0, 1] * feel[1] + pose[0, 2] * feel[2] + pose[0, 3]
+    y = pose[1, 0] * feel[0] + pose[1, 1] * feel[1] + pose[1, 2] * feel[2] + pose[1, 3]
+    z = pose[2, 0] * feel[0] + pose[2, 1] * feel[1] + pose[2, 2] * feel[2] + pose[2, 3]
+    distance_mm, gx, gy, gz = _at(addresses, line, grid, x, y, z, phase)
+    size = _pull(distance_mm, side, delta_mm, m)
+    scale = -f_max_n * size * _direction_scale(math.sqrt(gx * gx + gy * gy + gz * gz))
+    feel[3], feel[4], feel[5], feel[6] = scale * gx, scale * gy, scale * gz, distance_mm
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
+    """Add a share of a felt force, and of its torque about the handle."""
+    ax, ay, az = feel[0] - handle_mm[0], feel[1] - handle_mm[1], feel[2] - handle_mm[2]
+    x = pose[0, 0] * ax + pose[0, 1] * ay + pose[0, 2] * az
+    y = pose[1, 0] * ax + pose[1, 1] * ay + pose[1, 2] * az
+    z = pose[2, 0] * ax + pose[2, 1] * ay + pose[2, 2] * az
+    for axis in range(3):
+        found[axis] += weight * feel[3 + axis]
+    found[3] += weight * (y * feel[5] - z * feel[4])
+    found[4] += weight * (z * feel[3] - x * feel[5])
+    found[5] += weight * (x * feel[4] - y * feel[3])
+
+
+@njit(nogil=True, cache=True, fastmath=CONTRACT)
+def tool_force(law, line_mm, handle_mm, pose, phase, bound_n, found):  # type: ignore[no-untyped-def]
+    """Force and torque on a line of straight pieces: the mean over its length, within a bound.
+
+    The same steps as ``bf_tool_force`` of the C header: stretches are halved until Simpson's rule
+    changes the midpoint's by less than the bound, unless the distance, which changes by no more
+    than the way, shows that the whole stretch feels less than the bound.
+
+    Parameters
+    ----------
+    law
+        The first seven arguments of ``force_at``.
+    line_mm
+        ``(n, 3)`` points of the tool in its own frame; a closed line repeats its first.
+    handle_mm
+        ``(3,)`` in the tool's frame: torque is about it.
+    pose
+        4x4 ``mr_from_tool``.
+    phase, bound_n
+        Moment, and largest error of the force.
+    found
+        Where force (N) and torque (N mm) go: six numbers, 0 before.
+
+    Returns
+    -------
+    How often the field was asked.
+    """
+    grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
+    walk = np.zeros(3)
+    total = 0.0
+    for piece in range(len(line_mm) - 1):
+        total += _piece_length(line_mm, piece)
+    if len(line_mm) > 1:
+        walk[2] = _piece_length(line_mm, 0)
+    longest = 2.0 * min(grid[3], grid[4], grid[5])
+    count = max(math.ceil(total / (4.0 * longest)), 1)
+    stack, places = np.empty((HALVINGS + 2, 7)), np.empty((HALVINGS + 2, 4))
+    left, right = np.empty(7), np.empty(7)
+    asked = 0
+    for number in range(count):
+        middle = (number + 0.5) * total / count
+        _feel(law, line_mm, pose, phase, middle, walk, stack[0])
+        asked += 1
+        if total == 0.0:
+            _add(found, stack[0], 1.0, pose, handle_mm)
+            continue
+        places[0, 0], places[0, 1], places[0, 2], places[0, 3] = (
+            middle, total / count, 1.0 / count, 0.0,
+        )  # fmt: skip
+        top = 0
+        while top >= 0:
+            middle, length, share, depth = places[top]
+            here = stack[top]
+            way = 0.5 * length
+            farthest = abs(here[6]) + way if side == 0 else here[6] + side * way
+            if 2.0 * f_max_n * abs(_pull(farthest, side, delta_mm, m)) <= bound_n:
+                _add(found, here, share, pose, handle_mm)
+                top -= 1
+                continue
+            _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
+            _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
+            asked += 2
+            off = 0.0
+            for axis in range(3, 6):
+                change = 0.5 * (left[axis] + right[axis]) - here[axis]
+                off += change * change
+            if (length <= longest and off <= bound_n * bound_n) or depth == HALVINGS:
+                _add(found, left, share * 2 / 3, pose, handle_mm)
+                _add(found, right, share * 2 / 3, pose, handle_mm)
+                _add(found, here, -share / 3, pose, handle_mm)
+                top -= 1
+                continue
+            stack[top], stack[top + 1] = right, left
+            places[top, 0], places[top, 1] = middle + way / 2, way
+            places[top, 2], places[top, 3] = share / 2, depth + 1
+            places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way
+            places[top + 1, 2], places[top + 1, 3] = share / 2, depth + 1
+            top += 1
+    return asked

@@ -6,30 +6,44 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
 
 from pipeline.errors import InputError
+from pipeline.field.files import map_phase, read_metadata, require_manifest
 from pipeline.field.fixture import Fixture
-from pipeline.field.manifest import MANIFEST
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
 from pipeline.field.spline import timeline
-from pipeline.geometry import Float, Float32, Grid, Mask
+from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
 
-ATTRIBUTES = "zarr.json"
+if TYPE_CHECKING:
+    from pipeline.field.tool import Tool
+
 POINTS_A_WORKER = 16_384
 """Fewer points are answered before another thread would have started."""
+
+
+@dataclass(frozen=True, slots=True)
+class ToolForce:
+    """What a whole tool feels."""
+
+    force_n: Float
+    """``(3,)`` newtons, LPS."""
+
+    torque_nmm: Float
+    """``(3,)`` newton-millimetres about the handle, LPS."""
+
+    evaluations: int
+    """How often the field was asked."""
 
 
 class ForceField:
@@ -248,6 +262,55 @@ class ForceField:
             raise _not_finite(x_mm, y_mm, z_mm, phase)
         return force_n
 
+    def tool_force(
+        self,
+        tool: Tool,
+        mr_from_tool: Float,
+        phase: float,
+        fixture: str | None = None,
+        bound_n: float = 0.05,
+    ) -> ToolForce:
+        """Force and torque on a whole tool: the mean of the field's force over its length.
+
+        A tool thus feels no more than ``f_max``. Its lines are divided where the field demands
+        it, until the error of the force is below ``bound_n``.
+
+        Parameters
+        ----------
+        tool
+            From ``pipeline.field.tool``; ``read_tool`` reads one.
+        mr_from_tool
+            4x4, the tool's pose in LPS mm.
+        phase
+            Place in the heartbeat.
+        fixture
+            Which; the first when None.
+        bound_n
+            Largest error, newtons.
+
+        Raises
+        ------
+        InputError
+            When the pose is not rigid, a number not finite, or the fixture unknown.
+        """
+        from pipeline.field.kernels import tool_force
+
+        require_rigid(np.asarray(mr_from_tool), "mr_from_tool")
+        if not (bound_n > 0 and np.isfinite(phase)):
+            raise InputError(f"bound_n = {bound_n} must be above 0, and phase = {phase} finite")
+        self._fixture(fixture)
+        law = self._laws[fixture or self._first]
+        pose, handle_mm = np.asarray(mr_from_tool, float), np.array(tool.handle_mm)
+        found, weight, asked = np.zeros(6), 0.0, 0
+        for line_mm in tool.lines_mm():
+            part = np.zeros(6)
+            line = np.ascontiguousarray(line_mm, dtype=float)
+            asked += tool_force(law, line, handle_mm, pose, float(phase), float(bound_n), part)
+            length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) or 1.0
+            found += length * part
+            weight += length
+        return ToolForce(found[:3] / weight, found[3:] / weight, asked)
+
     _distance_at: Any = None
     _force_at: Any = None
 
@@ -337,75 +400,3 @@ def _as_phases(phase: npt.ArrayLike, count: int) -> Float:
     if not np.isfinite(phases).all():
         raise InputError("phase must be finite; it is a place in the heartbeat, [0, 1)")
     return phases
-
-
-def chunk_path(array: Path, index: int) -> Path:
-    """The file of one phase of a stored array: raw little-endian float32 ``(z, y, x)``."""
-    return array / "c" / str(index) / "0" / "0" / "0"
-
-
-def map_phase(array: Path, index: int, grid: Grid) -> Float32:
-    """Map one phase of a stored array into memory, read-only.
-
-    Raises
-    ------
-    InputError
-        When the file is missing or its size is wrong.
-    """
-    path = chunk_path(array, index)
-    size, needed = _size(path), 4 * int(np.prod(grid.shape))
-    if size != needed:
-        raise InputError(f"{path}: {size} bytes, {needed} were needed; bake the field again")
-    # A plain view: subclasses of arrays make every call into a compiled kernel slower.
-    return np.asarray(np.memmap(path, dtype="<f4", mode="r", shape=grid.shape))
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); bake it again") from error
-
-
-def require_manifest(path: Path) -> None:
-    """Raise InputError unless the folder has the manifest that is written last, and it agrees.
-
-    Only the attributes are compared with it; this is the check that costs nothing.
-    """
-    if not path.is_dir():
-        raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
-    try:
-        manifest = json.loads((path / MANIFEST).read_bytes())
-        expected = manifest["files"][ATTRIBUTES]["sha256"]
-        actual = hashlib.sha256((path / ATTRIBUTES).read_bytes()).hexdigest()
-    except FileNotFoundError as error:
-        missing = Path(error.filename).name
-        raise InputError(
-            f"{path}: has no {missing}, so it is no complete field; bake it again"
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path / MANIFEST}: cannot be read ({error!r}); bake again") from error
-    if expected != actual:
-        raise InputError(f"{path / ATTRIBUTES}: is not what the manifest says; bake it again")
-
-
-def read_metadata(path: Path) -> FieldMetadata:
-    """The ``beatfield`` attributes of a store.
-
-    Raises
-    ------
-    InputError
-        When they are missing or wrong.
-    """
-    source = path / ATTRIBUTES
-    try:
-        attributes = json.loads(source.read_bytes())["attributes"]["beatfield"]
-        return FieldMetadata.model_validate(attributes)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise InputError(f"{source}: beatfield.{place}: {first['msg']}") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{source}: holds no beatfield attributes ({error!r}); give a field.zarr"
-        ) from error

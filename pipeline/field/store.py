@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.field.files import chunk_path
 from pipeline.field.manifest import write_manifest
 from pipeline.field.metadata import FieldMetadata
-from pipeline.field.reader import chunk_path
 from pipeline.field.spline import time_solver
 from pipeline.field.verify import Report, verify_field
 from pipeline.geometry import Float32

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
+from pipeline.field.files import map_phase, read_metadata
 from pipeline.field.manifest import MANIFEST, canonical_manifest, entry
 from pipeline.field.metadata import FieldMetadata, FixturePart, StructurePart
 from pipeline.field.potential import offence, potential
-from pipeline.field.reader import map_phase, read_metadata
 from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.geometry import Float, Grid
 

@@ -1,0 +1,89 @@
+"""The files of a store as a reader meets them: found, checked, mapped into memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from pipeline.errors import InputError
+from pipeline.field.manifest import MANIFEST
+from pipeline.field.metadata import FieldMetadata
+from pipeline.geometry import Float32, Grid
+
+ATTRIBUTES = "zarr.json"
+
+
+def chunk_path(array: Path, index: int) -> Path:
+    """The file of one phase of a stored array: raw little-endian float32 ``(z, y, x)``."""
+    return array / "c" / str(index) / "0" / "0" / "0"
+
+
+def map_phase(array: Path, index: int, grid: Grid) -> Float32:
+    """Map one phase of a stored array into memory, read-only.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or its size is wrong.
+    """
+    path = chunk_path(array, index)
+    size, needed = _size(path), 4 * int(np.prod(grid.shape))
+    if size != needed:
+        raise InputError(f"{path}: {size} bytes, {needed} were needed; bake the field again")
+    # A plain view: subclasses of arrays make every call into a compiled kernel slower.
+    return np.asarray(np.memmap(path, dtype="<f4", mode="r", shape=grid.shape))
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); bake it again") from error
+
+
+def require_manifest(path: Path) -> None:
+    """Raise InputError unless the folder has the manifest that is written last, and it agrees.
+
+    Only the attributes are compared with it; this is the check that costs nothing.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
+    try:
+        manifest = json.loads((path / MANIFEST).read_bytes())
+        expected = manifest["files"][ATTRIBUTES]["sha256"]
+        actual = hashlib.sha256((path / ATTRIBUTES).read_bytes()).hexdigest()
+    except FileNotFoundError as error:
+        missing = Path(error.filename).name
+        raise InputError(
+            f"{path}: has no {missing}, so it is no complete field; bake it again"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path / MANIFEST}: cannot be read ({error!r}); bake again") from error
+    if expected != actual:
+        raise InputError(f"{path / ATTRIBUTES}: is not what the manifest says; bake it again")
+
+
+def read_metadata(path: Path) -> FieldMetadata:
+    """The ``beatfield`` attributes of a store.
+
+    Raises
+    ------
+    InputError
+        When they are missing or wrong.
+    """
+    source = path / ATTRIBUTES
+    try:
+        attributes = json.loads(source.read_bytes())["attributes"]["beatfield"]
+        return FieldMetadata.model_validate(attributes)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"{source}: beatfield.{place}: {first['msg']}") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{source}: holds no beatfield attributes ({error!r}); give a field.zarr"
+        ) from error

@@ -1,0 +1,151 @@
+"""Tools that are not points: lines whose every part feels the field.
+
+A tool is described in YAML by its shape and sizes, and becomes lines of straight pieces in the
+tool's own frame (mm): z along the shaft or axis, the tip (or the middle of a ring) at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
+
+from pipeline.errors import InputError
+from pipeline.field.fixture import Section
+from pipeline.geometry import Float
+
+Point = tuple[float, float, float]
+
+# A polygon of n corners is nowhere farther from its circle than r (1 - cos(pi / n)): 0.2 %.
+CORNERS = 48
+LINES_ROUND_A_CYLINDER = 8
+
+
+class _Tool(Section):
+    handle_mm: Point = (0.0, 0.0, 0.0)
+    """Where the hand holds it, in the tool's frame: torque is about this point."""
+
+
+class Needle(_Tool):
+    """A straight line from the tip up."""
+
+    shape: Literal["needle"]
+    length_mm: float = Field(gt=0)
+
+    def lines_mm(self) -> list[Float]:
+        """Its one line, ``(2, 3)``."""
+        return [np.array([[0.0, 0, 0], [0, 0, self.length_mm]])]
+
+
+class Cylinder(_Tool):
+    """A rod: its wall feels the field, along eight lines around the axis."""
+
+    shape: Literal["cylinder"]
+    length_mm: float = Field(gt=0)
+    radius_mm: float = Field(gt=0)
+
+    def lines_mm(self) -> list[Float]:
+        """Lines along the wall, ``(2, 3)`` each."""
+        up_mm = np.array([0.0, 0.0, self.length_mm])
+        angles = 2 * math.pi * np.arange(LINES_ROUND_A_CYLINDER) / LINES_ROUND_A_CYLINDER
+        feet = self.radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+        return [np.stack([foot, foot + up_mm]) for foot in feet]
+
+
+class Torus(_Tool):
+    """A ring about z, as its centre line."""
+
+    shape: Literal["torus"]
+    radius_mm: float = Field(gt=0)
+
+    def lines_mm(self) -> list[Float]:
+        """Its one closed line, the first point repeated."""
+        angles = 2 * math.pi * np.arange(CORNERS + 1) / CORNERS
+        ring = self.radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+        ring[-1] = ring[0]
+        return [ring]
+
+
+class Polyline(_Tool):
+    """Any line through given points."""
+
+    shape: Literal["polyline"]
+    points_mm: tuple[Point, ...] = Field(min_length=1)
+    closed: bool = False
+
+    def lines_mm(self) -> list[Float]:
+        """Its one line; a closed one repeats its first point."""
+        points = np.array(self.points_mm, dtype=float)
+        return [np.concatenate([points, points[:1]]) if self.closed else points]
+
+
+class Mesh(_Tool):
+    """Any closed or open triangle mesh, by points spread evenly over its surface."""
+
+    shape: Literal["mesh"]
+    path: Path
+    """VTP, STL, PLY or OBJ in the tool's frame, mm; a relative path starts at the YAML file."""
+    samples: int = Field(default=1000, ge=10, le=100_000)
+
+    def lines_mm(self) -> list[Float]:
+        """``samples`` lines of one point each.
+
+        Raises
+        ------
+        InputError
+            When the file is no triangle mesh.
+        """
+        import pyvista
+
+        try:
+            mesh = pyvista.read(self.path).extract_surface(algorithm=None).triangulate()
+            corners = np.asarray(mesh.points, float)[mesh.regular_faces]
+        except (OSError, ValueError, AttributeError) as error:
+            raise InputError(f"{self.path}: cannot be read as a tool's mesh ({error})") from error
+        return [point[None] for point in spread_points(corners, self.samples)]
+
+
+Tool = Annotated[Needle | Cylinder | Torus | Polyline | Mesh, Field(discriminator="shape")]
+
+
+def spread_points(corners_mm: Float, count: int) -> Float:
+    """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time."""
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    if not area.sum() > 0:
+        raise InputError("a tool's mesh has no area; give triangles")
+    chosen = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(count) + 0.5) / count)
+    # Steps of the plastic number: low-discrepancy places in the unit square, folded to a triangle.
+    u = (0.7548776662466927 * np.arange(count)) % 1
+    v = (0.5698402909980532 * np.arange(count)) % 1
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    weights = np.column_stack([1 - u - v, u, v])
+    points: Float = np.einsum("nk,nkd->nd", weights, corners_mm[np.minimum(chosen, len(area) - 1)])
+    return points
+
+
+def read_tool(path: Path) -> Tool:
+    """Read a tool's YAML file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or a key or value is wrong.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text())
+        if isinstance(content, dict) and "path" in content:
+            content["path"] = path.parent / str(content["path"])
+        tool: Tool = TypeAdapter(Tool).validate_python(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "(all)"
+        raise InputError(f"{path}: {place}: {first['msg']} (got {first['input']!r})") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: cannot be read as a tool ({error})") from error
+    return tool

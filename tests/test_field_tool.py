@@ -1,0 +1,133 @@
+"""Tools of any shape: read, divided, and felt like a plain sum over their points."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista
+from field_baked import FIXTURES, bake_small
+from scipy.spatial.transform import Rotation
+
+from pipeline.errors import InputError
+from pipeline.field import ForceField
+from pipeline.field.tool import Polyline, read_tool, spread_points
+
+TOOLS = sorted((Path(__file__).parent.parent / "configs" / "tools").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tool") / "field.zarr"
+    bake_small(folder)
+    return ForceField.open(folder)
+
+
+def poses(count: int):
+    rng = np.random.default_rng(8)
+    for _ in range(count):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform(-25, 25, 3)
+        yield pose, float(rng.uniform())
+
+
+def points_along(lines, count: int):
+    """Evenly spaced points over all lines together; ends once."""
+    lengths = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines]
+    points = []
+    for line, length in zip(lines, lengths, strict=True):
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        along = np.concatenate([[0], np.cumsum(steps)])
+        share = round(count * length / sum(lengths))
+        place = (np.arange(share) + 0.5) / share * length
+        points.append(np.column_stack([np.interp(place, along, line[:, k]) for k in range(3)]))
+    return np.concatenate(points)
+
+
+@pytest.mark.parametrize("path", TOOLS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("bound", [0.05, 0.01])
+def test_bound_holds_against_a_plain_sum(field, path, bound):
+    tool = read_tool(path)
+    along = points_along(tool.lines_mm(), 100_000)
+    for pose, phase in poses(8):
+        points = along @ pose[:3, :3].T + pose[:3, 3]
+        levers = (along - tool.handle_mm) @ pose[:3, :3].T
+        for name in FIXTURES:
+            found = field.tool_force(tool, pose, phase, name, bound)
+            forces = field.force_n(points, phase, name)
+            assert np.linalg.norm(found.force_n - forces.mean(axis=0)) <= bound
+            torque = np.cross(levers, forces).mean(axis=0)
+            farthest = np.linalg.norm(levers, axis=1).max()
+            assert np.linalg.norm(found.torque_nmm - torque) <= bound * farthest
+            assert np.linalg.norm(found.force_n) <= FIXTURES[name].f_max_n
+
+
+def test_a_tool_far_from_all_change_costs_next_to_nothing(field):
+    """A torus in the floor of a forbidden region: a few questions, no force."""
+    tool = read_tool(TOOLS[[path.stem for path in TOOLS].index("torus")])
+    pose = np.diag([0.2, 0.2, 0.2, 1.0])
+    pose[:3, :3] = np.eye(3)
+    found = field.tool_force(tool, pose, 0.05, "stay_in", 0.05)
+    assert found.evaluations <= 63 / (8 * 3.0) + 1
+    assert np.linalg.norm(found.force_n) <= 0.05
+
+
+def test_a_point_feels_what_a_point_feels(field):
+    tool = Polyline(shape="polyline", points_mm=((0.0, 0.0, 0.0),), handle_mm=(0.0, 0.0, -10.0))
+    for pose, phase in poses(5):
+        found = field.tool_force(tool, pose, phase)
+        expected = field.force_n(pose[None, :3, 3], phase)[0]
+        np.testing.assert_allclose(found.force_n, expected, rtol=1e-12, atol=1e-15)
+        lever = pose[:3, :3] @ (0, 0, 10)
+        np.testing.assert_allclose(found.torque_nmm, np.cross(lever, expected), atol=1e-12)
+
+
+def test_a_mesh_is_felt_over_its_surface(field, tmp_path):
+    """A small ball of samples: its mean force is near its centre's."""
+    pyvista.Icosphere(radius=2.0, nsub=3).save(tmp_path / "ball.stl")
+    (tmp_path / "ball.yaml").write_text("shape: mesh\npath: ball.stl\nsamples: 500\n")
+    tool = read_tool(tmp_path / "ball.yaml")
+    points = np.concatenate(tool.lines_mm())
+    assert points.shape == (500, 3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 2.0, atol=0.03)
+    assert np.abs(points.mean(axis=0)).max() < 0.1
+    pose, phase = next(poses(1))
+    moved = points @ pose[:3, :3].T + pose[:3, 3]
+    expected = field.force_n(moved, phase).mean(axis=0)
+    np.testing.assert_allclose(field.tool_force(tool, pose, phase).force_n, expected, atol=1e-12)
+
+
+def test_samples_spread_evenly_over_area():
+    """Two triangles, one three times the other: samples by area, to one."""
+    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[5, 0, 0], [8, 0, 0], [5, 1, 0]]])
+    points = spread_points(corners.astype(float), 400)
+    assert abs((points[:, 0] < 2).sum() - 100) <= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("shape: spoon\n", "spoon"),
+        ("shape: needle\nlength_mm: -3\n", "length_mm"),
+        ("shape: needle\nlength_mm: 3\ncolour: red\n", "colour"),
+        ("shape: [\n", "cannot be read"),
+        ("shape: polyline\npoints_mm: []\n", "points_mm"),
+    ],
+)
+def test_wrong_tools_are_refused(tmp_path, text, words):
+    (tmp_path / "t.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_tool(tmp_path / "t.yaml")
+
+
+def test_wrong_questions_about_tools_are_refused(field, tmp_path):
+    tool = read_tool(TOOLS[0])
+    with pytest.raises(InputError, match="mr_from_tool"):
+        field.tool_force(tool, 2 * np.eye(4), 0.1)
+    with pytest.raises(InputError, match="bound_n"):
+        field.tool_force(tool, np.eye(4), 0.1, bound_n=0)
+    with pytest.raises(InputError, match="no fixture"):
+        field.tool_force(tool, np.eye(4), 0.1, "none")
+    (tmp_path / "t.yaml").write_text("shape: mesh\npath: none.stl\n")
+    with pytest.raises(InputError, match=r"none\.stl"):
+        read_tool(tmp_path / "t.yaml").lines_mm()
