@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.field.certificate import BeatingSurface, certify
+from pipeline.field.certificate import BeatingSurface, certify, require_bounds
 from pipeline.field.distance import (
     distance_of_closed,
     require_no_open_edge,
@@ -97,6 +97,8 @@ def bake_field(
     InputError
         When a fixture's surface is missing, a surface is open or faces inwards, phases differ,
         or the field would be larger than the settings allow.
+    StageError
+        When the finished field is not as exact as ``settings.bounds`` demand.
     """
     chosen = _choose(surfaces, fixtures, settings)
     phases = _shared_phases(chosen)
@@ -123,6 +125,7 @@ def bake_field(
         count.step()
     writer.solve_splines_in_time()
     accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
+    require_bounds(accuracy, settings.bounds, settings.spacing_mm)
     writer.finish(metadata.model_copy(update={"accuracy": accuracy}))
     return accuracy
 

@@ -1,7 +1,7 @@
 """The accuracy certificate of a baked field: measured on the finished values, none assumed.
 
-Distances are checked against VTK, which shares no code with the baking; forces are compared
-between neighbouring nodes and between phases.
+Distances and directions are checked against VTK, which shares no code with the baking; forces are
+compared between neighbouring nodes and phases, and between places 0.1 mm and moments 1 ms apart.
 """
 
 from __future__ import annotations
@@ -12,15 +12,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pipeline.field.distance import processors
-from pipeline.field.reader import ForceField
+from pipeline.errors import StageError
+from pipeline.field.exact import ExactSurface, points_about
+from pipeline.field.exact import vtk_distance as vtk_distance
+from pipeline.field.fixture import DEVICES, Bounds
+from pipeline.field.reader import ForceField, processors
 from pipeline.geometry import Float, Surface
 
 BAND_MM = 15.0
 """How far from the surface the interpolated distance is checked."""
-
-SIGN_TOLERANCE_MM = 0.1
-"""A sign counts as wrong where the exact distance is larger than this."""
+DIRECTION_BAND_MM = 5.0
+DIRECTION_SAMPLES = 60
+"""Directions are checked nearer, at fewer points: there the fixtures act."""
+STEP_MM, STEP_MS = 0.1, 1.0
+FORCE_SAMPLES = 4000
 
 
 class BeatingSurface(Protocol):
@@ -58,7 +63,7 @@ def certify(
     Largest errors over all, and per structure and fixture.
     """
     distances: dict[str, list[dict[str, Any]]] = {name: [] for name in volume.structures}
-    forces = {name: _ForceSteps(volume, name) for name in volume.fixtures}
+    forces = {name: _ForceSteps(volume, name, surfaces) for name in volume.fixtures}
     with ThreadPoolExecutor(processors()) as pool:
         for index in range(len(volume.phases)):
             steps = [pool.submit(one.add, index) for one in forces.values()]
@@ -67,118 +72,166 @@ def certify(
             for step in steps:
                 step.result()
             progress()
-    structures = {name: _over_phases(found) for name, found in distances.items()}
+    structures = {
+        name: _over_phases(found) | {"drift_max_mm": _drift_mm(volume, name, surfaces[name])}
+        for name, found in distances.items()
+    }
     fixtures = {name: one.result() for name, one in forces.items()}
     return {
-        **_over_structures(distances),
-        **_over_fixtures(fixtures),
+        **_largest(structures),
+        **_largest(fixtures),
         "samples_per_phase": samples,
         "band_mm": BAND_MM,
-        "sign_tolerance_mm": SIGN_TOLERANCE_MM,
         "structures": structures,
         "fixtures": fixtures,
     }
 
 
-def points_about(surface: Surface, rng: np.random.Generator, count: int, band_mm: float) -> Float:
-    """Random points at most ``band_mm`` from a surface: ``(count, 3)``, uniform over its area."""
-    corners = surface.vertices_mm[surface.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    chosen = corners[rng.choice(len(area), size=count, p=area / area.sum())]
-    weights = rng.dirichlet(np.ones(3), size=count)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    away_mm = rng.uniform(0, band_mm, size=(count, 1))
-    points: Float = np.einsum("nk,nkd->nd", weights, chosen) + away_mm * direction
-    return points
+def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: float) -> None:
+    """Refuse a field whose certificate is not within bounds.
 
-
-def vtk_distance(surface: Surface, points_mm: Float) -> Float:
-    """Exact signed distance of ``(n, 3)`` points by VTK, negative inside, mm."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-    from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-
-    places, cells = vtkPoints(), vtkCellArray()
-    places.SetData(numpy_to_vtk(np.ascontiguousarray(surface.vertices_mm), deep=1))
-    offsets = np.arange(0, 3 * len(surface.triangles) + 1, 3)
-    connectivity = np.ascontiguousarray(surface.triangles.ravel())
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=1), numpy_to_vtkIdTypeArray(connectivity, deep=1)
-    )
-    mesh = vtkPolyData()
-    mesh.SetPoints(places)
-    mesh.SetPolys(cells)
-    implicit = vtkImplicitPolyDataDistance()
-    implicit.SetInput(mesh)
-    found = vtkDoubleArray()
-    implicit.EvaluateFunction(numpy_to_vtk(np.ascontiguousarray(points_mm), deep=1), found)
-    distance: Float = vtk_to_numpy(found).copy()
-    return distance
+    Raises
+    ------
+    StageError
+        Naming every bound that is broken.
+    """
+    limits = {
+        "node_error_near_mm": bounds.node_error_near_mm,
+        "node_error_far_mm": bounds.node_error_far_mm,
+        "sign_errors": bounds.sign_errors,
+        "surface_error_p99_mm": bounds.surface_error_p99_spacings * spacing_mm,
+    }
+    broken = [
+        f"{name} is {accuracy[name]:.4g}, allowed is {limit:.4g}"
+        for name, limit in limits.items()
+        if not accuracy[name] <= limit
+    ]
+    if broken:
+        raise StageError(
+            f"bake: the field is not as exact as it must be: {'; '.join(broken)}; choose a finer "
+            "bake.spacing_mm, or allow more in bake.bounds"
+        )
 
 
 def _distance_errors(
     volume: ForceField, structure: str, index: int, moving: BeatingSurface, samples: int
 ) -> dict[str, Any]:
-    """Errors of one phase, at points about the surface and at nodes anywhere."""
+    """Errors of one phase: on the surface, about it, at nodes anywhere, and of directions."""
     rng = np.random.default_rng(index)
     surface = moving.at(index)
-    points_mm = points_about(surface, rng, samples, BAND_MM)
-    points_mm = points_mm[volume.contains(points_mm)]
+    exact = ExactSurface(surface)
+    phase = volume.phases[index]
+    about_mm = points_about(surface, rng, samples, BAND_MM)
+    about_mm = about_mm[volume.contains(about_mm)]
+    found_mm = volume.distance_mm(about_mm, phase, structure)
+    on_mm = points_about(surface, rng, samples, 0.0)
     stored = volume.stored_distance_mm(structure, index)
     nodes = np.unravel_index(rng.integers(stored.size, size=samples // 2), stored.shape)
     grid = volume.grid
     nodes_mm = grid.origin_mm + np.column_stack(nodes[::-1]) * np.array(grid.spacing_mm)
-    exact_mm = vtk_distance(surface, np.concatenate([points_mm, nodes_mm]))
-    between_mm = volume.distance_mm(points_mm, volume.phases[index], structure)
-    found_mm = np.concatenate([between_mm, stored[nodes]])
-    error_mm = np.abs(found_mm - exact_mm)
-    wrong = np.signbit(found_mm) != np.signbit(exact_mm)
+    at_nodes_mm = exact.distance_mm(nodes_mm)
+    off_mm = np.abs(stored[nodes] - at_nodes_mm)
+    near = np.abs(at_nodes_mm) <= BAND_MM
+    # Zero may have either sign.
+    wrong = (np.signbit(stored[nodes]) != np.signbit(at_nodes_mm)) & (off_mm > 1e-6)
     return {
-        "between": error_mm[: len(points_mm)],
-        "nodes": float(error_mm[len(points_mm) :].max()),
-        "signs": int((wrong & (np.abs(exact_mm) > SIGN_TOLERANCE_MM)).sum()),
+        "between": np.abs(found_mm - exact.distance_mm(about_mm)),
+        "surface": np.abs(volume.distance_mm(on_mm, phase, structure)),
+        "near": float(off_mm[near].max(initial=0.0)),
+        "far": float(off_mm[~near].max(initial=0.0)),
+        "signs": int(wrong.sum()),
+        "turned": _direction_errors(volume, structure, float(phase), surface, exact, rng),
     }
 
 
+def _direction_errors(
+    volume: ForceField,
+    structure: str,
+    phase: float,
+    surface: Surface,
+    exact: ExactSurface,
+    rng: np.random.Generator,
+) -> Float:
+    """Angles in degrees between the gradient and the way to the nearest point of the surface."""
+    points_mm = points_about(surface, rng, DIRECTION_SAMPLES, DIRECTION_BAND_MM)
+    distance_mm, nearest_mm = exact.nearest(points_mm)
+    # On the surface itself the way to it has no direction.
+    clear = np.abs(distance_mm) > 0.2
+    away = (points_mm - nearest_mm)[clear] / distance_mm[clear, None]
+    gradient = volume.gradient(points_mm[clear], phase, structure)
+    cosine = np.einsum("ij,ij->i", away, gradient) / np.linalg.norm(gradient, axis=1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
 def _over_phases(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    every = np.concatenate([one["between"] for one in found])
+    between, surface, turned = (
+        np.concatenate([one[part] for one in found]) for part in ("between", "surface", "turned")
+    )
     return {
-        "distance_error_max_mm": float(every.max()),
-        "distance_error_p99_mm": float(np.percentile(every, 99)),
+        "distance_error_max_mm": float(between.max()),
+        "distance_error_p99_mm": float(np.percentile(between, 99)),
         "distance_error_max_mm_by_phase": [float(one["between"].max()) for one in found],
-        "node_error_max_mm": max(one["nodes"] for one in found),
+        "surface_error_max_mm": float(surface.max()),
+        "surface_error_p99_mm": float(np.percentile(surface, 99)),
+        "node_error_near_mm": max(one["near"] for one in found),
+        "node_error_far_mm": max(one["far"] for one in found),
+        "direction_error_median_deg": float(np.median(turned)),
+        "direction_error_p99_deg": float(np.percentile(turned, 99)),
         "sign_errors": sum(one["signs"] for one in found),
     }
 
 
-def _over_structures(distances: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    whole = _over_phases([one for found in distances.values() for one in found])
-    del whole["distance_error_max_mm_by_phase"]
-    return whole
+def _drift_mm(volume: ForceField, structure: str, moving: BeatingSurface) -> float | None:
+    """How far the field's surface is, halfway between phases, from the smoothly moving one.
+
+    The vertices' own periodic cubic spline in time is the measure; None where vertices do not
+    correspond, or phases are too few for a spline.
+    """
+    from scipy.interpolate import CubicSpline
+
+    phases = volume.phases
+    each = [moving.at(index) for index in range(len(phases))]
+    same = all(one.triangles is each[0].triangles for one in each)
+    if not same or len(phases) < 3:
+        return None
+    chosen = np.random.default_rng(0).integers(len(each[0].vertices_mm), size=500)
+    places = np.stack([one.vertices_mm[chosen] for one in [*each, each[0]]])
+    path = CubicSpline(np.append(phases, phases[0] + 1), places, bc_type="periodic")
+    gaps = np.diff(phases, append=phases[0] + 1)
+    largest = 0.0
+    for moment in phases + gaps / 2:
+        off_mm = volume.distance_mm(path(moment), moment, structure)
+        largest = max(largest, float(np.percentile(np.abs(off_mm), 99)))
+    return largest
 
 
-def _over_fixtures(fixtures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The largest of every figure; unknown (None) where any fixture's is."""
-    names = next(iter(fixtures.values()))
-    columns = {name: [one[name] for one in fixtures.values()] for name in names}
-    return {name: None if None in values else max(values) for name, values in columns.items()}
+def _largest(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The largest of every figure, counts added; unknown (None) where any part's is."""
+    first = next(iter(parts.values()))
+    columns = {name: [one[name] for one in parts.values()] for name in first}
+    return {
+        name: None if None in values else sum(values) if name == "sign_errors" else max(values)
+        for name, values in columns.items()
+        if not name.endswith("_by_phase")
+    }
 
 
 class _ForceSteps:
     """Largest steps of one fixture's force, gathered phase by phase in their order."""
 
-    def __init__(self, volume: ForceField, name: str) -> None:
+    def __init__(
+        self, volume: ForceField, name: str, surfaces: Mapping[str, BeatingSurface]
+    ) -> None:
         self._volume = volume
         self._name = name
-        self._fixture = fixture = volume.fixtures[name]
-        self._near_mm = 2 * fixture.resolved_delta_mm
+        self._fixture = volume.fixtures[name]
+        self._surface = surfaces[self._fixture.structure]
+        self._near_mm = 2 * self._fixture.resolved_delta_mm
         self._first_n: Float | None = None
         self._before_n: Float | None = None
         self._steps_n = np.zeros((2, 3))
         self._changes_n: list[float] = []
+        self._samples_n: list[tuple[float, float | None, float]] = []
 
     def add(self, index: int) -> None:
         """Measure phase ``index``, and the change to it from the phase before."""
@@ -193,6 +246,7 @@ class _ForceSteps:
             self._changes_n.append(float(largest_change(self._before_n, force_n)))
         self._first_n = force_n if self._first_n is None else self._first_n
         self._before_n = force_n
+        self._samples_n.append(self._small_steps(index))
 
     def _forces(self, index: int) -> Float:
         grid = self._volume.grid
@@ -200,19 +254,40 @@ class _ForceSteps:
         phase = self._volume.phases[index]
         return self._volume.force_n(nodes_mm, phase, self._name).reshape(*grid.shape, 3)
 
+    def _small_steps(self, index: int) -> tuple[float, float | None, float]:
+        """Largest change of force over 0.1 mm and over 1 ms, and steepest slope, N/m."""
+        rng = np.random.default_rng(index)
+        volume, name = self._volume, self._name
+        surface = self._surface.at(index)
+        points_mm = points_about(surface, rng, FORCE_SAMPLES, self._near_mm + BAND_MM)
+        moments = rng.uniform(size=len(points_mm))
+        here_n = volume.force_n(points_mm, moments, name)
+        ways = rng.normal(size=points_mm.shape)
+        ways *= STEP_MM / np.linalg.norm(ways, axis=1, keepdims=True)
+        step_n = np.linalg.norm(volume.force_n(points_mm + ways, moments, name) - here_n, axis=1)
+        late = None
+        if volume.rr_s is not None:
+            after_n = volume.force_n(points_mm, moments + STEP_MS / 1000 / volume.rr_s, name)
+            late = float(np.linalg.norm(after_n - here_n, axis=1).max())
+        close = np.abs(volume.distance_mm(points_mm, moments, self._fixture.structure))
+        near = step_n[close <= self._near_mm].max(initial=0.0)
+        return float(step_n.max()), late, 1000 * float(near) / STEP_MM
+
     def result(self) -> dict[str, Any]:
         """The largest steps over space and, the cycle closed, over time."""
         from pipeline.field.steps import largest_change
 
         changes_n = [*self._changes_n, float(largest_change(self._before_n, self._first_n))]
-        phases, rr_s = self._volume.phases, self._volume.rr_s
-        gaps = np.diff(phases, append=phases[0] + 1)
-        rate = None if rr_s is None else float(max(changes_n / (gaps * rr_s * 1000)))
         spacing_mm = np.array(self._volume.grid.spacing_mm)
+        steps, lates, slopes = zip(*self._samples_n, strict=True)
         return {
             "force_step_max_n": float(self._steps_n[0].max()),
             "force_step_max_n_per_mm": float((self._steps_n[0] / spacing_mm).max()),
             "force_step_near_surface_n_per_mm": float((self._steps_n[1] / spacing_mm).max()),
             "force_change_max_n": max(changes_n),
-            "force_change_max_n_per_ms": rate,
+            "force_change_max_n_per_ms": None if None in lates else max(lates) / STEP_MS,
+            "force_step_max_n_per_0_1_mm": max(steps),
+            "stiffness_measured_n_per_m": max(slopes),
+            "stiffness_n_per_m": self._fixture.stiffness_n_per_m,
+            "stiffness_limit_n_per_m": DEVICES[self._fixture.device].stiffness_n_per_m,
         }

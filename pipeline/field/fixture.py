@@ -191,6 +191,23 @@ DEFAULT_FIXTURES: dict[str, Fixture] = {
 """The fixtures of the default configuration, all of which a Touch can render."""
 
 
+class Bounds(Section):
+    """What the certificate of a field must keep to; a field that does not is not published."""
+
+    node_error_near_mm: float = Field(default=1e-3, gt=0)
+    """Of stored distances within 15 mm of the surface."""
+
+    node_error_far_mm: float = Field(default=0.02, gt=0)
+    """Of stored distances farther away."""
+
+    sign_errors: int = Field(default=0, ge=0)
+    """Nodes on the wrong side of the surface."""
+
+    surface_error_p99_spacings: float = Field(default=0.25, gt=0)
+    """Of the interpolated distance on the surface, but for one point in a hundred, in units of
+    the grid's spacing."""
+
+
 class BakeSettings(Section):
     """How surfaces become grids."""
 
@@ -205,6 +222,9 @@ class BakeSettings(Section):
 
     samples: int = Field(default=500, ge=100)
     """Random points per surface and phase at which the finished field is checked."""
+
+    bounds: Bounds = Bounds()
+    """How exact the finished field must be."""
 
     largest_store_mb: float = Field(default=4000.0, gt=0)
     """A field that would take more on disk is refused before work begins."""

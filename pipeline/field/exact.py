@@ -1,0 +1,72 @@
+"""Exact distances by VTK, to measure a baked field by: it shares no code with the baking."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.geometry import Float, Surface
+
+
+class ExactSurface:
+    """A closed surface that answers one point after another, exactly and slowly."""
+
+    def __init__(self, surface: Surface) -> None:
+        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+        from vtkmodules.vtkCommonCore import vtkPoints
+        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
+
+        places, cells = vtkPoints(), vtkCellArray()
+        places.SetData(numpy_to_vtk(np.ascontiguousarray(surface.vertices_mm), deep=1))
+        offsets = np.arange(0, 3 * len(surface.triangles) + 1, 3)
+        connectivity = np.ascontiguousarray(surface.triangles.ravel())
+        cells.SetData(
+            numpy_to_vtkIdTypeArray(offsets, deep=1), numpy_to_vtkIdTypeArray(connectivity, deep=1)
+        )
+        mesh = vtkPolyData()
+        mesh.SetPoints(places)
+        mesh.SetPolys(cells)
+        self._implicit: Any = vtkImplicitPolyDataDistance()
+        self._implicit.SetInput(mesh)
+
+    def distance_mm(self, points_mm: Float) -> Float:
+        """Signed distance of ``(n, 3)`` points, negative inside, mm."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+        from vtkmodules.vtkCommonCore import vtkDoubleArray
+
+        found = vtkDoubleArray()
+        self._implicit.EvaluateFunction(
+            numpy_to_vtk(np.ascontiguousarray(points_mm, dtype=float), deep=1), found
+        )
+        return np.asarray(vtk_to_numpy(found).copy())
+
+    def nearest(self, points_mm: Float) -> tuple[Float, Float]:
+        """Signed distances of ``(n, 3)`` points, and the nearest points of the surface."""
+        nearest_mm = np.empty((len(points_mm), 3))
+        distance_mm = np.empty(len(points_mm))
+        place = [0.0, 0.0, 0.0]
+        for number, point in enumerate(points_mm):
+            distance_mm[number] = self._implicit.EvaluateFunctionAndGetClosestPoint(point, place)
+            nearest_mm[number] = place
+        return distance_mm, nearest_mm
+
+
+def vtk_distance(surface: Surface, points_mm: Float) -> Float:
+    """Exact signed distance of ``(n, 3)`` points to a closed surface, negative inside, mm."""
+    return ExactSurface(surface).distance_mm(points_mm)
+
+
+def points_about(surface: Surface, rng: np.random.Generator, count: int, band_mm: float) -> Float:
+    """Random points at most ``band_mm`` from a surface: ``(count, 3)``, uniform over its area."""
+    corners = surface.vertices_mm[surface.triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    chosen = corners[rng.choice(len(area), size=count, p=area / area.sum())]
+    weights = rng.dirichlet(np.ones(3), size=count)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    away_mm = rng.uniform(0, band_mm, size=(count, 1))
+    points: Float = np.einsum("nk,nkd->nd", weights, chosen) + away_mm * direction
+    return points
