@@ -45,14 +45,19 @@ def _write_patients(options: argparse.Namespace) -> None:
         folder = options.out / settings.patient_id
         line = ProgressLine(settings.patient_id)
         try:
-            write_study(folder, settings, line, options.overwrite)
+            write_study(folder, settings, line, options.overwrite, options.preview)
         finally:
             line.end()
         sys.stdout.write(f"{folder}\n")
 
 
 def _changes(options: argparse.Namespace) -> dict[str, Any]:
-    given = {"seed": options.seed, "cine": options.cine, "cine_only": options.cine_only or None}
+    given = {
+        "seed": options.seed,
+        "pathology": options.pathology,
+        "cine": options.cine,
+        "cine_only": options.cine_only or None,
+    }
     return {name: value for name, value in given.items() if value is not None}
 
 
@@ -66,7 +71,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, help="patient number k has seed N + k - 1 (default 1)")
     parser.add_argument("--patients", type=int, default=1, metavar="N", help="how many (default 1)")
     parser.add_argument("--config", type=Path, metavar="YAML", help="settings of the phantom")
-    parser.add_argument("--cine", choices=["dicom", "nifti"], help="format of the cine")
+    parser.add_argument(
+        "--pathology",
+        metavar="NAME",
+        help="healthy (default), dilated_cardiomyopathy, hypertrophic_cardiomyopathy, rv_dilation, "
+        "infarct or enlarged_atrium",
+    )
+    parser.add_argument(
+        "--cine", choices=["dicom", "enhanced", "nifti"], help="format of the cine (default dicom)"
+    )
+    parser.add_argument(
+        "--preview", action="store_true", help="write preview.html too: one page that shows it all"
+    )
     parser.add_argument("--cine-only", action="store_true", help="leave out ECG and ultrasound")
     parser.add_argument("--overwrite", action="store_true", help="replace studies that exist")
     return parser

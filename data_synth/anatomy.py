@@ -1,7 +1,12 @@
 """The heart at the R peak as closed implicit surfaces in its own frame.
 
-Every function gives a distance-like value in millimetres, negative inside, whose slope is close
-to 1 near the surface. Bodies are joined and cut by smooth minima and maxima.
+Every function gives a distance-like value in millimetres, negative inside. Bodies are joined and
+cut by smooth minima and maxima of first-order distances, so the values are not quite distances.
+Against the exact distance to the truth meshes, at points within 4 mm of a surface: the zero sets
+agree within 0.15 mm (facets of the mesh), the mean error is below 0.15 mm, 99 % are off by less
+than 1.5 mm, and no value is larger than 1.3 times the distance (below it by more where a seam is
+concave or the right ventricle thins out to its edge). ``tests/test_phantom_anatomy.py`` holds them
+to these bounds.
 """
 
 from __future__ import annotations
@@ -11,13 +16,28 @@ import math
 import numpy as np
 
 from data_synth.kernels import Float, Label, Shape, Tubes, compiled
-from data_synth.profiles import endocardium, epicardium, rv_depth, rv_share
+from data_synth.lining import lv_lining, lv_wall, rv_lining
+from data_synth.primitives import (
+    box_distance,
+    boxed_tube,
+    bullet,
+    ellipsoid,
+    joined,
+    smooth_max,
+    smooth_min,
+    tube,
+)
+from data_synth.profiles import (
+    endocardium,
+    endocardium_at,
+    epicardium,
+    is_round,
+    rv_depth,
+    rv_share,
+)
 from data_synth.tissue import Tissue
 
 FAT = int(Tissue.FAT)
-LV_CAVITY = int(Tissue.LV_CAVITY)
-LV_MYOCARDIUM = int(Tissue.LV_MYOCARDIUM)
-RV_CAVITY = int(Tissue.RV_CAVITY)
 RV_WALL = int(Tissue.RV_WALL)
 LEFT_ATRIUM = int(Tissue.LEFT_ATRIUM)
 RIGHT_ATRIUM = int(Tissue.RIGHT_ATRIUM)
@@ -25,78 +45,55 @@ ATRIAL_WALL = int(Tissue.ATRIAL_WALL)
 AORTA = int(Tissue.AORTA)
 VESSEL_WALL = int(Tissue.VESSEL_WALL)
 BLOOD_VESSEL = int(Tissue.BLOOD_VESSEL)
+PERICARDIUM = int(Tissue.PERICARDIUM)
+LEAFLET = int(Tissue.LEAFLET)
 
 BOX_MM = ((-75.0, 110.0), (-85.0, 115.0), (-145.0, 115.0))
 """Heart-frame box (x, y, z) that holds every part of any heart that can be drawn."""
 VESSEL_WALL_MM = 1.8
 SEPTUM_MM = 3.0
 """Wall between the atria."""
-
-
-@compiled
-def smooth_min(a: float, b: float, k: float) -> float:
-    """Union of two bodies, its seam rounded over k mm (polynomial smooth minimum)."""
-    h = max(k - abs(a - b), 0.0) / k
-    return min(a, b) - h * h * k / 4
-
-
-@compiled
-def smooth_max(a: float, b: float, k: float) -> float:
-    """Intersection of two bodies, its edge rounded over k mm."""
-    h = max(k - abs(a - b), 0.0) / k
-    return max(a, b) + h * h * k / 4
-
-
-@compiled
-def tube(x: float, y: float, z: float, line: Float) -> float:
-    """Distance to a tube of varying radius: union of tapered capsules along its centre line."""
-    best = 1e9
-    for k in range(len(line) - 1):
-        ax, ay, az, ar = line[k]
-        ex, ey, ez = line[k + 1, 0] - ax, line[k + 1, 1] - ay, line[k + 1, 2] - az
-        px, py, pz = x - ax, y - ay, z - az
-        t = (px * ex + py * ey + pz * ez) / (ex * ex + ey * ey + ez * ez)
-        t = min(max(t, 0.0), 1.0)
-        px, py, pz = px - t * ex, py - t * ey, pz - t * ez
-        radius = ar + t * (line[k + 1, 3] - ar)
-        squared = px * px + py * py + pz * pz
-        if squared < (best + radius) ** 2:
-            best = math.sqrt(squared) - radius
-    return best
-
-
-@compiled
-def ellipsoid(x: float, y: float, z: float, rx: float, ry: float, rz: float) -> float:
-    """First-order distance to an ellipsoid about the origin."""
-    k0 = math.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
-    k1 = math.sqrt((x / rx**2) ** 2 + (y / ry**2) ** 2 + (z / rz**2) ** 2)
-    return k0 * (k0 - 1) / k1 if k1 > 1e-9 else -min(rx, ry, rz)
-
-
-@compiled
-def bullet(s: float, value: float, slope: float) -> float:
-    """First-order distance to the outline s = value(z) of squared radius s."""
-    return (s - value) / math.sqrt(4 * s + slope * slope + 4)
+LEAFLET_MM = 1.0
+"""Thickness of the closed mitral and tricuspid leaflets, the gap between the bodies there."""
+REACH_MM, VESSEL_REACH_MM = 26.0, 14.0
+"""Tubes and vessels farther than this from a point take no part in anything there."""
+STUB_REACH_MM = 30.0
+"""Vein stubs end nearer than this to the atrium's ball."""
+SAC_TOP_MM = 52.0
+"""The pericardium ends on the great vessels at this height above the mitral plane."""
+VESSEL_FAT_MM = 3.5
+"""Outer edge of wall and fat round a vessel outside the pericardium."""
 
 
 @compiled
 def lv_cavity(x: float, y: float, z: float, shape: Shape) -> float:
     """Left-ventricular cavity, closed by the mitral plane."""
-    value, slope = endocardium(z, shape)
-    return smooth_max(bullet(x * x + y * y, value, slope), z, 3.0)
+    if is_round(shape):
+        value, slope = endocardium(z, shape)
+        return smooth_max(bullet(x * x + y * y, value, slope, 0.0), z, 3.0)
+    value, slope, around = endocardium_at(z, math.atan2(y, x), shape)
+    return smooth_max(bullet(x * x + y * y, value, slope, around), z, 3.0)
 
 
 @compiled
 def lv_outside(x: float, y: float, z: float, shape: Shape) -> float:
     """Left-ventricular muscle with its cavity, closed by the mitral plane."""
     value, slope = epicardium(z, shape)
-    return smooth_max(bullet(x * x + y * y, value, slope), z, 4.0)
+    return smooth_max(bullet(x * x + y * y, value, slope, 0.0), z, 4.0)
 
 
 @compiled
-def aorta(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> float:
-    """Aortic root and ascending aorta, from the base plane up."""
-    return smooth_max(tube(x, y, z, tubes.aorta), 0.3 - z, 2.0)
+def aorta(x: float, y: float, z: float, pipe: float, tubes: Tubes) -> float:
+    """Aortic root with its three sinuses and ascending aorta, from the base plane up.
+
+    ``pipe`` is the distance to the aorta's tube.
+    """
+    if -8.0 < z < 36.0 and pipe < 12.0:
+        for k in range(3):
+            cx, cy, cz, radius = tubes.sinuses[k]
+            ball = math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - radius
+            pipe = smooth_min(pipe, ball, 2.0)
+    return smooth_max(pipe, 0.3 - z, 2.0)
 
 
 @compiled
@@ -112,35 +109,37 @@ def crescent(x: float, y: float, z: float, shape: Shape) -> float:
     steep = math.sqrt(1 + along * along + around * around)
     if depth <= 0.0 or share <= 0.0:
         # Beyond its tip the outline is no longer a graph: keep the value positive and growing.
-        return max(r - base, 0.0) / steep + max(-depth, 0.0) + 10 * max(-share, 0.0)
+        return max(r - base, 0.0) / steep + max(-depth, 0.0) + 25 * max(-share, 0.0)
     return (r - base - depth * share) / steep
 
 
 @compiled
-def rv_cavity(x: float, y: float, z: float, shape: Shape, tubes: Tubes, lv: float) -> float:
-    """Right ventricle with its outflow, up to the tricuspid plane and the pulmonary valve."""
+def rv_cavity(
+    x: float, y: float, z: float, shape: Shape, tubes: Tubes, lv: float, pipe: float
+) -> float:
+    """Right ventricle with its outflow, up to the tricuspid plane and the pulmonary valve.
+
+    Kept off the left ventricle and the aorta's tube, whose distances are ``lv`` and ``pipe``.
+    """
     body = smooth_max(crescent(x, y, z, shape), z + 1.5, 6.0)
-    whole = smooth_min(body, tube(x, y, z, tubes.outflow), 8.0)
-    whole = smooth_max(whole, VESSEL_WALL_MM + 1.0 - tube(x, y, z, tubes.aorta), 3.0)
+    whole = joined(x, y, z, body, tubes.outflow, tubes.boxes[1], 8.0, REACH_MM)
+    whole = smooth_max(whole, VESSEL_WALL_MM + 1.0 - pipe, 3.0)
     return smooth_max(whole, 0.3 - lv, 4.0)
 
 
 @compiled
 def left_atrium(x: float, y: float, z: float, shape: Shape, tubes: Tubes, root: float) -> float:
-    """Left atrium with funnel and appendage; ``root`` is the distance to the aorta."""
-    ball = ellipsoid(
-        x - shape.la_x,
-        y - shape.la_y,
-        z - shape.la_z,
-        shape.la_radius_x,
-        shape.la_radius_y,
-        shape.la_radius_z,
-    )
-    radius = math.sqrt((x - shape.la_x) ** 2 + (y - shape.la_y - 1) ** 2)
+    """Left atrium with funnel, appendage and vein stubs; ``root`` is the distance to the aorta."""
+    dx, dy, dz = x - shape.la_x, y - shape.la_y, z - shape.la_z
+    ball = ellipsoid(dx, dy, dz, shape.la_radius_x, shape.la_radius_y, shape.la_radius_z)
+    radius = math.sqrt(dx * dx + (dy - 1) ** 2)
     funnel = smooth_max(radius - shape.mitral_radius, z - 12.0, 4.0)
     whole = smooth_min(ball, funnel, 8.0)
-    whole = smooth_min(whole, tube(x, y, z, tubes.appendage), 5.0)
-    whole = smooth_max(whole, 0.3 - z, 2.0)
+    whole = joined(x, y, z, whole, tubes.appendage, tubes.boxes[2], 5.0, REACH_MM)
+    if -20.0 < ball < STUB_REACH_MM:
+        for k in range(4):
+            whole = smooth_min(whole, tube(x, y, z, tubes.veins[k, :2]), 5.0)
+    whole = smooth_max(whole, LEAFLET_MM - z, 2.0)
     return smooth_max(whole, VESSEL_WALL_MM + 1 - root, 4.0)
 
 
@@ -159,7 +158,7 @@ def right_atrium(
     )
     radius = math.sqrt((x - shape.ra_x) ** 2 + (y - shape.ra_y) ** 2)
     funnel = smooth_max(radius - shape.tricuspid_radius, z - 12.0, 4.0)
-    whole = smooth_max(smooth_min(ball, funnel, 8.0), -1.2 - z, 2.0)
+    whole = smooth_max(smooth_min(ball, funnel, 8.0), LEAFLET_MM - 1.5 - z, 2.0)
     whole = smooth_max(whole, VESSEL_WALL_MM + 1 - root, 4.0)
     whole = smooth_max(whole, SEPTUM_MM - left, 4.0)
     return smooth_max(whole, 0.3 - right, 2.0)
@@ -170,8 +169,9 @@ def bodies(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> tuple[fl
     """Values of (lv cavity, epicardium, rv cavity, left atrium, right atrium, aorta)."""
     inner = lv_cavity(x, y, z, shape)
     lv = lv_outside(x, y, z, shape)
-    root = aorta(x, y, z, shape, tubes)
-    right = rv_cavity(x, y, z, shape, tubes, lv)
+    pipe = boxed_tube(x, y, z, tubes.aorta, tubes.boxes[0], VESSEL_REACH_MM)
+    root = aorta(x, y, z, pipe, tubes)
+    right = rv_cavity(x, y, z, shape, tubes, lv, pipe)
     left = left_atrium(x, y, z, shape, tubes, root)
     return inner, lv, right, left, right_atrium(x, y, z, shape, root, left, right), root
 
@@ -185,26 +185,71 @@ def whole_heart(values: tuple[float, ...]) -> float:
 
 
 @compiled
+def vessel_at(x: float, y: float, z: float, trunk: float, tubes: Tubes) -> float:
+    """Distance to the nearest vessel that is no body of its own; ``trunk`` is the pulmonary."""
+    boxes, best = tubes.boxes, trunk
+    best = min(best, boxed_tube(x, y, z, tubes.right_branch, boxes[5], min(best, VESSEL_REACH_MM)))
+    best = min(best, boxed_tube(x, y, z, tubes.left_branch, boxes[6], min(best, VESSEL_REACH_MM)))
+    best = min(best, boxed_tube(x, y, z, tubes.upper_cava, boxes[7], min(best, VESSEL_REACH_MM)))
+    best = min(best, boxed_tube(x, y, z, tubes.lower_cava, boxes[8], min(best, VESSEL_REACH_MM)))
+    if box_distance(x, y, z, boxes[3]) < min(best, VESSEL_REACH_MM):
+        for k in range(4):
+            best = min(best, tube(x, y, z, tubes.veins[k, 1:]))
+    return best
+
+
+@compiled
+def is_leaflet(x: float, y: float, z: float, shape: Shape) -> bool:
+    """Whether a point outside all bodies lies in the closed mitral or tricuspid valve."""
+    if -0.5 < z < LEAFLET_MM + 0.5:
+        mitral = (x - shape.la_x) ** 2 + (y - shape.la_y - 1) ** 2
+        if mitral < shape.mitral_radius**2:
+            return True
+    if -2.0 < z < LEAFLET_MM - 1.0:
+        tricuspid = (x - shape.ra_x) ** 2 + (y - shape.ra_y) ** 2
+        return tricuspid < shape.tricuspid_radius**2
+    return False
+
+
+@compiled
 def tissue_at(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> int:
     """Tissue at a heart-frame point at the R peak; 0 outside the heart."""
-    if lv_cavity(x, y, z, shape) < 0:
-        return LV_CAVITY
-    if lv_outside(x, y, z, shape) < 0:
-        return LV_MYOCARDIUM
-    _, lv, right, left, ra, root = bodies(x, y, z, shape, tubes)
+    inner = lv_cavity(x, y, z, shape)
+    if inner < 0:
+        return lv_lining(x, y, z, -inner, shape, tubes)
+    lv = lv_outside(x, y, z, shape)
+    if lv < 0:
+        return lv_wall(x, y, z, shape)
+    pipe = boxed_tube(x, y, z, tubes.aorta, tubes.boxes[0], VESSEL_REACH_MM)
+    root = aorta(x, y, z, pipe, tubes)
     if root < 0:
         return AORTA
+    right = rv_cavity(x, y, z, shape, tubes, lv, pipe)
     if right < 0:
-        return RV_CAVITY
+        return rv_lining(x, y, z, -right, shape, tubes)
+    left = left_atrium(x, y, z, shape, tubes, root)
     if left < 0:
         return LEFT_ATRIUM
+    ra = right_atrium(x, y, z, shape, root, left, right)
     if ra < 0:
         return RIGHT_ATRIUM
-    vessel = min(tube(x, y, z, tubes.pulmonary), tube(x, y, z, tubes.cava))
+    if is_leaflet(x, y, z, shape):
+        return LEAFLET
+    return around_bodies(x, y, z, shape, tubes, (lv, right, left, ra, root))
+
+
+@compiled
+def around_bodies(
+    x: float, y: float, z: float, shape: Shape, tubes: Tubes, near: tuple[float, ...]
+) -> int:
+    """Walls, vessels, fat and pericardium outside the bodies, whose distances are ``near``."""
+    lv, right, left, ra, root = near
     if root < VESSEL_WALL_MM:
         return VESSEL_WALL
     if right < shape.rv_wall and z < 4:
         return RV_WALL
+    trunk = boxed_tube(x, y, z, tubes.pulmonary, tubes.boxes[4], VESSEL_REACH_MM)
+    vessel = vessel_at(x, y, z, trunk, tubes)
     if vessel < 0:
         return BLOOD_VESSEL
     if right < shape.rv_wall:
@@ -213,10 +258,16 @@ def tissue_at(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> int:
         return ATRIAL_WALL
     if vessel < VESSEL_WALL_MM:
         return VESSEL_WALL
-    ventricles = smooth_min(lv, right - shape.rv_wall, 24.0)
-    atria = smooth_min(left, ra, 24.0) - shape.atrial_wall
-    around = smooth_min(smooth_min(ventricles, atria, 24.0), min(root, vessel), 16.0)
-    return FAT if around < shape.fat_depth else 0
+    ventricles = smooth_min(lv, right - shape.rv_wall, 18.0)
+    atria = smooth_min(left, ra, 18.0) - shape.atrial_wall
+    sac = smooth_min(ventricles, atria, 18.0)
+    great = max(min(root, trunk), z - SAC_TOP_MM)
+    sac = smooth_min(sac, great, 8.0) - shape.fat_depth
+    if sac < 0:
+        return FAT
+    if sac < shape.pericardium:
+        return PERICARDIUM
+    return FAT if min(root, vessel) < VESSEL_FAT_MM else 0
 
 
 @compiled
@@ -252,44 +303,3 @@ BODY_NAMES = (
     "heart",
 )
 """Names of the bodies in the order of :func:`sample_bodies`."""
-
-
-def bend(points: list[tuple[float, float, float, float]], count: int) -> Float:
-    """Smooth centre line of ``count`` pieces through (x, y, z, radius) points."""
-    from scipy.interpolate import CubicSpline
-
-    knots = np.linspace(0, 1, len(points))
-    line = CubicSpline(knots, np.array(points), axis=0)(np.linspace(0, 1, count + 1))
-    return np.ascontiguousarray(line)
-
-
-def build_tubes(shape: Shape) -> Tubes:
-    """Vessels, outflow and appendage that fit a heart of this shape."""
-    r = shape.aorta_radius
-    wide = (shape.lv_radius + shape.lv_wall) / 36.5
-    a, f = shape.appendage_length, shape.appendage_radius
-    left, front, top = shape.la_x - 17, shape.la_y + 14, shape.la_z + 3
-    return Tubes(
-        aorta=bend([(10, 9, -3, r - 2), (13, 17, 22, r + 1), (15, 40, 45, r), (8, 72, 62, r)], 8),
-        outflow=bend(
-            [(46 * wide, 24 * wide, -26, 13), (36 * wide, 40 * wide, -6, 13), (17, 53, 12, 12)], 6
-        ),
-        pulmonary=bend([(17, 53, 12, 12), (2, 62, 30, 12.5), (-10, 64, 50, 12)], 5),
-        appendage=bend(
-            [
-                (left, front, top, f),
-                (left - 12 * a, front + 13 * a, top - 4 * a, f - 1),
-                (left - 9 * a, front + 30 * a, top - 9 * a, f - 2.5),
-                (left + 4 * a, front + 40 * a, top - 10 * a, f - 4.5),
-            ],
-            7,
-        ),
-        cava=bend(
-            [
-                (shape.ra_x - 4, shape.ra_y + 14, shape.ra_z + 14, 9),
-                (shape.ra_x - 6, shape.ra_y + 50, shape.ra_z + 34, 9),
-                (shape.ra_x - 10, shape.ra_y + 90, shape.ra_z + 55, 9),
-            ],
-            3,
-        ),
-    )

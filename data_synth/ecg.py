@@ -1,10 +1,9 @@
-"""A simulated electrocardiogram whose R peaks are known.
+"""A simulated electrocardiogram whose beats are known.
 
-Each beat is a sum of Gaussian waves (P, Q, R, S, T) placed on a list of R times, after McSharry,
-Clifford, Tarassenko and Smith, "A dynamical model for generating synthetic electrocardiogram
-signals", IEEE Trans Biomed Eng 50 (2003) 289-294. On top come what electrodes pick up besides:
-baseline wander, mains, muscle and, inside the scanner, the voltage that blood flowing through the
-static field induces (the magnetohydrodynamic effect: it swells the ST segment and the T wave).
+`rhythm` says when the heart beats, `ecg_waves` what its electric vector then does and how leads see
+it, `ecg_noise` what electrodes pick up besides. Inside the scanner, blood that flows through the
+static field adds a voltage (the magnetohydrodynamic effect), which swells the ST segment and the T
+wave.
 """
 
 from __future__ import annotations
@@ -15,61 +14,38 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
-from scipy.signal import butter, sosfiltfilt
 
+from data_synth import ecg_noise, ecg_waves
+from data_synth.ecg_settings import ALL_LEADS, LEADS, EcgSettings, LostLead
 from data_synth.errors import SynthError
+from data_synth.rhythm import Breath, Kind, Rhythm, draw_breath, draw_rhythm
 
 Float = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-LEADS = ("I", "II", "V1")
+__all__ = [
+    "ALL_LEADS",
+    "LEADS",
+    "EcgSettings",
+    "EcgSignal",
+    "LostLead",
+    "phase_at",
+    "simulate_ecg",
+    "write_annotations",
+    "write_wfdb",
+]
 
-# Offset from the R peak (s, at an RR interval of 1 s), width (s, standard deviation) and height
-# (mV) in each lead. Two T waves of different width make the slow rise and quick fall of a real T.
-_WAVES: dict[str, tuple[float, float, tuple[float, float, float]]] = {
-    "P": (-0.165, 0.022, (0.08, 0.13, 0.06)),
-    "Q": (-0.027, 0.008, (-0.06, -0.10, 0.00)),
-    "R": (0.000, 0.0105, (0.70, 1.10, 0.24)),
-    "S": (0.028, 0.0100, (-0.12, -0.20, -0.95)),
-    "T rise": (0.260, 0.055, (0.12, 0.18, -0.04)),
-    "T fall": (0.300, 0.032, (0.10, 0.15, -0.04)),
+# Codes of the MIT-BIH arrhythmia database.
+_BEAT_CODES: dict[Kind, str] = {
+    "normal": "N",
+    "premature_ventricular": "V",
+    "premature_atrial": "A",
+    "fibrillation": "N",
 }
-# A beat from the ventricle's own muscle spreads slowly: wide, tall, no P, T against the QRS.
-_ECTOPIC_WAVES: dict[str, tuple[float, float, tuple[float, float, float]]] = {
-    "R": (0.000, 0.030, (-0.80, 1.50, 1.20)),
-    "S": (0.085, 0.030, (0.20, -0.50, -0.40)),
-    "T": (0.300, 0.060, (0.25, -0.45, -0.35)),
-}
-# Flow through the aortic arch: offset (s), width (s) and share of a wave whose sum peaks at 1.
-# Peak 0.15 to 0.2 s after R, a weak reflected wave in diastole.
-_FLOW_WAVES = ((0.15, 0.045, 0.86), (0.25, 0.060, 0.52), (0.42, 0.060, -0.22))
-_FLOW_BY_LEAD = (0.8, 1.0, -0.6)
-
-
-class EcgSettings(BaseModel):
-    """How regular the heart beats and how clean the recording is."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    respiration_hz: float = Field(default=0.25, gt=0, lt=1)
-    respiratory_variation: float = Field(default=0.04, ge=0, le=0.2)
-    """Respiratory sinus arrhythmia: swing of the RR interval as a fraction of its mean."""
-    jitter: float = Field(default=0.015, ge=0, le=0.1)
-    """Standard deviation of the rest of the RR variation, as a fraction of the mean."""
-    ectopic_probability: float = Field(default=0.0, ge=0, le=0.3)
-    """Chance that a beat comes early from the ventricle and is followed by a pause."""
-    baseline_mv: float = Field(default=0.12, ge=0)
-    mains_mv: float = Field(default=0.02, ge=0)
-    mains_hz: float = Field(default=50.0, gt=0)
-    muscle_mv: float = Field(default=0.015, ge=0)
-    magnetohydrodynamic_mv: float = Field(default=0.0, ge=0)
-    """Height of the flow artefact in lead II; about 0.5 at 1.5 T, 1 at 3 T, 0 off the scanner.
-    In a study it shows in the record made during MR alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +62,33 @@ class EcgSignal:
     """Samples a second."""
 
     r_times_s: Float
-    """``(beats,)`` rising times of the R waves inside the recording."""
+    """``(beats,)`` rising R times inside the recording.
+
+    The R time of a beat of any kind is the instant at which its own QRS complex, in lead II, with
+    breath at its mean and nothing else in the lead, is farthest from the baseline. Leads that look
+    elsewhere peak at other times: the S wave of V1 comes some 20 ms later. The interval from one R
+    time to the next, whatever their kinds, is the beat that phases divide.
+    """
 
     ectopic: Mask
     """``(beats,)`` True where the beat came from the ventricle."""
+
+    kinds: tuple[Kind, ...] = ()
+    """``(beats,)`` where each beat came from."""
+
+    lost: tuple[LostLead, ...] = ()
+    """Stretches without signal, asked for or drawn, in order of their start."""
+
+    fibrillation_s: tuple[tuple[float, float], ...] = ()
+    """Stretches of atrial fibrillation inside the recording."""
+
+    def valid(self) -> Mask:
+        """``(n, leads)`` False where a lead is lost."""
+        times_s = np.arange(len(self.signal_mv)) / self.sampling_rate_hz
+        valid = np.ones(self.signal_mv.shape, dtype=bool)
+        for one in self.lost:
+            valid[_stretch(times_s, one), _columns(one, self.leads)] = False
+        return valid
 
 
 def simulate_ecg(
@@ -99,22 +98,30 @@ def simulate_ecg(
     sampling_rate_hz: float = 500.0,
     settings: EcgSettings | None = None,
 ) -> EcgSignal:
-    """Record the leads I, II and V1 of a heart that beats every ``mean_rr_s`` on average.
+    """Record the leads of a heart that beats every ``mean_rr_s`` on average.
+
+    Beats, waves and each disturbance draw from streams of their own: a change of one leaves the
+    others as they were.
 
     Raises
     ------
     SynthError
-        When the recording is too short for two beats, or the rates are not physiological.
+        When the recording is too short for three beats, or the rates are not physiological.
     """
     settings = settings or EcgSettings()
     _require_sensible(duration_s, mean_rr_s, sampling_rate_hz, settings)
-    r_times_s, ectopic = _beats(rng, duration_s, mean_rr_s, settings)
+    streams = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=10)]
+    breath = draw_breath(streams[0], duration_s, settings)
+    rhythm = draw_rhythm(streams[1], duration_s, mean_rr_s, breath, settings)
     times_s = np.arange(round(duration_s * sampling_rate_hz)) / sampling_rate_hz
-    signal_mv = _electrical(times_s, r_times_s, ectopic, settings)
-    signal_mv += _flow_artefact(rng, times_s, r_times_s, settings.magnetohydrodynamic_mv)
-    signal_mv += _disturbances(rng, times_s, sampling_rate_hz, settings)
-    inside = (r_times_s >= 0) & (r_times_s <= times_s[-1])
-    return EcgSignal(signal_mv, LEADS, sampling_rate_hz, r_times_s[inside], ectopic[inside])
+    heart_mv = _heart(streams[2:4], times_s, rhythm, breath, settings)
+    signal_mv = heart_mv @ ecg_waves.lead_vectors(settings.leads)
+    signal_mv += _scanner(streams[4:6], times_s, rhythm, sampling_rate_hz, settings)
+    muscle_mv = _muscle_mv(heart_mv, settings)
+    signal_mv += _disturbances(streams[6:9], times_s, breath, sampling_rate_hz, settings, muscle_mv)
+    lost = _lost(streams[9], duration_s, settings)
+    signal_mv = _recorded(signal_mv, times_s, lost, settings)
+    return _with_truth(signal_mv, sampling_rate_hz, times_s, rhythm, lost, settings)
 
 
 def phase_at(times_s: Float, r_times_s: Float) -> Float:
@@ -176,6 +183,54 @@ def write_wfdb(folder: Path, name: str, signal: EcgSignal) -> None:
         )
 
 
+def write_annotations(folder: Path, name: str, signal: EcgSignal) -> None:
+    """Write the truth about the beats as WFDB annotations, ``name.atr``, into ``folder``.
+
+    Codes are those of the MIT-BIH arrhythmia database: N, V (early from the ventricle) and A (early
+    from the atrium) at the sample nearest to each R time; + with ``(N`` or ``(AFIB`` where the
+    rhythm changes; ~ with ``lost LEAD`` and ``back LEAD`` where a lead comes off and comes back.
+    """
+    last = len(signal.signal_mv) - 1
+    rows = [
+        (round(time_s * signal.sampling_rate_hz), _BEAT_CODES[kind], "")
+        for time_s, kind in zip(signal.r_times_s, signal.kinds, strict=True)
+    ]
+    marks = _rhythm_marks(signal) + _lost_marks(signal)
+    rows += [(round(time_s * signal.sampling_rate_hz), code, note) for time_s, code, note in marks]
+    # Of a mark and a beat at one sample the mark comes first.
+    rows = sorted(((min(sample, last), code, note) for sample, code, note in rows), key=_in_order)
+    folder.mkdir(parents=True, exist_ok=True)
+    with _quiet_wfdb() as wfdb:
+        wfdb.wrann(
+            name,
+            "atr",
+            np.array([sample for sample, _, _ in rows]),
+            symbol=[code for _, code, _ in rows],
+            aux_note=[note for _, _, note in rows],
+            fs=signal.sampling_rate_hz,
+            write_dir=str(folder),
+        )
+
+
+def _in_order(row: tuple[int, str, str]) -> tuple[int, bool, str]:
+    return row[0], not row[2], row[2]
+
+
+def _rhythm_marks(signal: EcgSignal) -> list[tuple[float, str, str]]:
+    """The rhythm at the start and wherever it changes."""
+    end_s = len(signal.signal_mv) / signal.sampling_rate_hz
+    changes = {0.0: "(N"}
+    for start_s, stop_s in signal.fibrillation_s:
+        changes |= {start_s: "(AFIB", stop_s: "(N"}
+    return [(time_s, "+", note) for time_s, note in changes.items() if time_s < end_s]
+
+
+def _lost_marks(signal: EcgSignal) -> list[tuple[float, str, str]]:
+    """Where leads come off and come back."""
+    starts = [(one.start_s, "~", f"lost {one.lead}") for one in signal.lost]
+    return starts + [(one.end_s, "~", f"back {one.lead}") for one in signal.lost]
+
+
 @contextmanager
 def _quiet_wfdb() -> Iterator[Any]:
     """The library, imported when first needed: it brings pandas, and calls deprecated parts."""
@@ -190,102 +245,155 @@ def _require_sensible(
     """Refuse rates that would fold waves or leave no beat to see."""
     if not 0.3 <= mean_rr_s <= 2.5:
         raise SynthError(f"mean_rr_s = {mean_rr_s} is no heart rate; choose 0.3 to 2.5 s")
-    if not duration_s >= 3 * mean_rr_s:
-        raise SynthError(f"duration_s = {duration_s} is under three beats of {mean_rr_s} s")
-    if not sampling_rate_hz > 2 * max(settings.mains_hz, 50.0):
+    if not 3 * mean_rr_s <= duration_s <= 86400:
         raise SynthError(
-            f"sampling_rate_hz = {sampling_rate_hz} cannot carry {settings.mains_hz} Hz mains; "
-            "choose more than twice that, and more than 100"
+            f"duration_s = {duration_s} is under three beats of {mean_rr_s} s or over a day"
         )
+    if not 100 <= sampling_rate_hz <= 2000:
+        raise SynthError(
+            f"sampling_rate_hz = {sampling_rate_hz} does not fit an ECG; choose 100 to 2000"
+        )
+    late = [one for one in settings.lost if one.end_s > duration_s]
+    stretch = settings.fibrillation_s
+    if late or (stretch is not None and stretch[0] >= duration_s):
+        what = f"lost lead {late[0].lead}" if late else f"fibrillation_s = {stretch}"
+        raise SynthError(f"{what}: lies past the recording of {duration_s} s; choose earlier times")
 
 
-def _beats(
-    rng: np.random.Generator, duration_s: float, mean_rr_s: float, settings: EcgSettings
-) -> tuple[Float, Mask]:
-    """R times from before 0 to past the end, and which beats are ectopic."""
-    breath = rng.uniform(0, 2 * np.pi)
-    times = [-mean_rr_s * rng.uniform(1.0, 2.0)]
-    ectopic = [False]
-    while times[-1] < duration_s + mean_rr_s:
-        angle = 2 * np.pi * settings.respiration_hz * times[-1] + breath
-        swing = settings.respiratory_variation * np.sin(angle)
-        jitter = settings.jitter * np.clip(rng.normal(), -3, 3)
-        early = not ectopic[-1] and rng.random() < settings.ectopic_probability
-        # The sinus rhythm goes on under an early beat: early and pause add up to two beats.
-        factor = 0.65 if early else 1.35 if ectopic[-1] else 1.0
-        times.append(times[-1] + mean_rr_s * factor * (1 + swing + jitter))
-        ectopic.append(early)
-    return np.array(times), np.array(ectopic)
-
-
-def _electrical(times_s: Float, r_times_s: Float, ectopic: Mask, settings: EcgSettings) -> Float:
-    """The heart's own voltage, ``(n, leads)`` mV."""
-    signal_mv = np.zeros((len(times_s), len(LEADS)))
-    rr_s = np.diff(r_times_s, prepend=2 * r_times_s[0] - r_times_s[1])
-    for r_s, beat_rr_s, early in zip(r_times_s, rr_s, ectopic, strict=True):
-        near = slice(*np.searchsorted(times_s, (r_s - 0.7, r_s + 1.2)))
-        # Breathing tilts the heart and with it the height of the waves.
-        tilt = 1 + 0.06 * np.sin(2 * np.pi * settings.respiration_hz * r_s)
-        # Bazett: repolarisation shortens with the root of the interval before it.
-        stretch = np.sqrt(beat_rr_s)
-        waves = _ECTOPIC_WAVES if early else _WAVES
-        for name, (offset_s, width_s, height_mv) in waves.items():
-            scale = 1.0 if name in "QRS" else stretch
-            bump = _gaussian(times_s[near] - r_s, offset_s * scale, width_s * scale)
-            signal_mv[near] += tilt * bump[:, None] * np.array(height_mv)
-    return signal_mv
-
-
-def _flow_artefact(
-    rng: np.random.Generator, times_s: Float, r_times_s: Float, height_mv: float
+def _heart(
+    streams: list[np.random.Generator],
+    times_s: Float,
+    rhythm: Rhythm,
+    breath: Breath,
+    settings: EcgSettings,
 ) -> Float:
-    """Voltage of the blood that flows through the static field, ``(n, leads)`` mV."""
-    one_lead = np.zeros(len(times_s))
-    for r_s in r_times_s:
-        near = slice(*np.searchsorted(times_s, (r_s - 0.2, r_s + 1.0)))
-        strength = height_mv * (1 + 0.1 * rng.normal())
-        shift_s = 0.008 * rng.normal()
-        for offset_s, width_s, share in _FLOW_WAVES:
-            bump = _gaussian(times_s[near] - r_s, offset_s + shift_s, width_s)
-            one_lead[near] += strength * share * bump
-    return np.asarray(one_lead[:, None] * np.array(_FLOW_BY_LEAD))
+    """The heart's own vector, ``(n, 3)`` mV."""
+    vector_mv = ecg_waves.heart_vector(
+        streams[0],
+        times_s,
+        rhythm,
+        breath,
+        qtc_s=settings.qtc_ms / 1000,
+        qt_correction=settings.qt_correction,
+        focus=settings.ectopic_focus,
+        modulation=settings.respiratory_modulation,
+    )
+    return vector_mv + ecg_waves.fibrillation_vector(
+        streams[1],
+        times_s,
+        rhythm.fibrillation_s,
+        settings.fibrillation_wave_hz,
+        settings.fibrillation_wave_mv,
+    )
+
+
+def _scanner(
+    streams: list[np.random.Generator],
+    times_s: Float,
+    rhythm: Rhythm,
+    rate_hz: float,
+    settings: EcgSettings,
+) -> Float:
+    """What the scanner adds, ``(n, leads)`` mV."""
+    height_mv = settings.magnetohydrodynamic_mv * settings.field_strength_t / 1.5
+    flow_mv = ecg_waves.flow_vector(streams[0], times_s, rhythm, height_mv)
+    added_mv = flow_mv @ ecg_waves.lead_vectors(settings.leads)
+    if settings.gradient_mv:
+        switched = ecg_noise.gradients(
+            streams[1], times_s, rhythm.r_times_s, settings.gradient_segment_s, rate_hz
+        )
+        added_mv += settings.gradient_mv * switched @ ecg_noise.lead_weights(settings.leads)
+    return np.asarray(added_mv)
+
+
+def _muscle_mv(heart_mv: Float, settings: EcgSettings) -> float:
+    """Standard deviation of muscle noise."""
+    if settings.muscle_snr_db is None:
+        return settings.muscle_mv
+    lead_ii_mv = heart_mv @ ecg_waves.lead_vectors(("II",))
+    return float(lead_ii_mv.std() * 10 ** (-settings.muscle_snr_db / 20))
 
 
 def _disturbances(
-    rng: np.random.Generator, times_s: Float, sampling_rate_hz: float, settings: EcgSettings
+    streams: list[np.random.Generator],
+    times_s: Float,
+    breath: Breath,
+    rate_hz: float,
+    settings: EcgSettings,
+    muscle_mv: float,
 ) -> Float:
-    """Baseline wander, mains and muscle, ``(n, leads)`` mV; each lead has its own share."""
-    columns = [
-        settings.baseline_mv * _wander(rng, times_s, settings.respiration_hz)
-        + settings.mains_mv * _mains(rng, times_s, settings.mains_hz)
-        + settings.muscle_mv * _muscle(rng, len(times_s), sampling_rate_hz)
-        for _ in LEADS
-    ]
-    return np.stack(columns, axis=1)
+    """Drift, mains, muscle and movement, ``(n, leads)`` mV."""
+    at_electrodes = settings.baseline_mv * ecg_noise.wander(streams[0], times_s, breath)
+    if settings.mains_mv:
+        hum = ecg_noise.mains(streams[1], times_s, settings.mains_hz, rate_hz)
+        at_electrodes += settings.mains_mv * hum
+    noisy = streams[2].spawn(2)
+    at_electrodes += muscle_mv * ecg_noise.muscle(noisy[0], len(times_s), rate_hz)
+    moved = ecg_noise.motion(noisy[1], times_s, settings.motion_per_minute)
+    at_electrodes += settings.motion_mv * moved
+    return np.asarray(at_electrodes @ ecg_noise.lead_weights(settings.leads))
 
 
-def _wander(rng: np.random.Generator, times_s: Float, respiration_hz: float) -> Float:
-    """Slow drift of about unit amplitude: breathing and three slower waves."""
-    rates_hz = np.array([respiration_hz, *rng.uniform(0.03, 0.2, 3)])
-    heights = np.array([0.5, *rng.uniform(0.1, 0.4, 3)])
-    angles = 2 * np.pi * rates_hz * times_s[:, None] + rng.uniform(0, 2 * np.pi, 4)
-    return np.asarray(np.sin(angles) @ heights)
+def _lost(
+    rng: np.random.Generator, duration_s: float, settings: EcgSettings
+) -> tuple[LostLead, ...]:
+    """Stretches that were asked for, and those that chance adds."""
+    lost = list(settings.lost)
+    for _ in range(rng.poisson(settings.lost_per_minute * duration_s / 60)):
+        start_s = rng.uniform(0, duration_s)
+        end_s = min(start_s + max(rng.exponential(settings.lost_mean_s), 0.05), duration_s)
+        lead = settings.leads[rng.integers(len(settings.leads))]
+        kind: Literal["flat", "rail"] = "rail" if rng.random() < 0.5 else "flat"
+        lost.append(LostLead(lead=lead, start_s=start_s, end_s=end_s, kind=kind))
+    return tuple(sorted(lost, key=lambda one: (one.start_s, one.end_s, one.lead)))
 
 
-def _mains(rng: np.random.Generator, times_s: Float, mains_hz: float) -> Float:
-    """Hum of unit amplitude whose strength drifts slowly."""
-    drift = 1 + 0.2 * np.sin(2 * np.pi * 0.07 * times_s + rng.uniform(0, 2 * np.pi))
-    return np.asarray(drift * np.sin(2 * np.pi * mains_hz * times_s + rng.uniform(0, 2 * np.pi)))
+def _recorded(
+    signal_mv: Float, times_s: Float, lost: tuple[LostLead, ...], settings: EcgSettings
+) -> Float:
+    """What the amplifier makes of the voltages: leads off, and an end to its range."""
+    for one in lost:
+        if one.kind == "rail":
+            left = settings.range_mv * ecg_noise.recovery(times_s, one.end_s)
+            signal_mv[:, _columns(one, settings.leads)] += left[:, None]
+    signal_mv = np.clip(signal_mv, -settings.range_mv, settings.range_mv)
+    for one in lost:
+        level_mv = settings.range_mv if one.kind == "rail" else 0.0
+        signal_mv[_stretch(times_s, one), _columns(one, settings.leads)] = level_mv
+    return signal_mv
 
 
-def _muscle(rng: np.random.Generator, count: int, sampling_rate_hz: float) -> Float:
-    """Noise of unit standard deviation in the band of skeletal muscle, 20 Hz upwards."""
-    upper_hz = min(150.0, 0.45 * sampling_rate_hz)
-    band = butter(2, (20.0, upper_hz), "bandpass", fs=sampling_rate_hz, output="sos")
-    noise = np.asarray(sosfiltfilt(band, rng.normal(size=count)))
-    return np.asarray(noise / noise.std())
+def _stretch(times_s: Float, one: LostLead) -> slice:
+    """Samples from start to before end."""
+    first, last = np.searchsorted(times_s, (one.start_s, one.end_s))
+    return slice(int(first), int(last))
 
 
-def _gaussian(offset_s: Float, centre_s: float, width_s: float) -> Float:
-    """Bell of unit height."""
-    return np.asarray(np.exp(-0.5 * ((offset_s - centre_s) / width_s) ** 2))
+def _columns(one: LostLead, leads: tuple[str, ...]) -> slice:
+    """Columns of the lead that is lost."""
+    if one.lead == "all":
+        return slice(None)
+    column = leads.index(one.lead)
+    return slice(column, column + 1)
+
+
+def _with_truth(
+    signal_mv: Float,
+    rate_hz: float,
+    times_s: Float,
+    rhythm: Rhythm,
+    lost: tuple[LostLead, ...],
+    settings: EcgSettings,
+) -> EcgSignal:
+    """The recording with what is known of the part of the rhythm inside it."""
+    inside = (rhythm.r_times_s >= 0) & (rhythm.r_times_s <= times_s[-1])
+    kinds = tuple(kind for kind, here in zip(rhythm.kinds, inside, strict=True) if here)
+    ectopic = np.array([kind == "premature_ventricular" for kind in kinds], dtype=bool)
+    end_s = len(times_s) / rate_hz
+    fibrillation_s = tuple(
+        (max(start_s, 0.0), min(stop_s, end_s)) for start_s, stop_s in rhythm.fibrillation_s
+    )
+    r_times_s = rhythm.r_times_s[inside]
+    return EcgSignal(
+        signal_mv, settings.leads, rate_hz, r_times_s, ectopic, kinds, lost, fibrillation_s
+    )

@@ -3,26 +3,30 @@
 The tissues are sampled in the transducer's own polar raster. Scatterers below the resolution give
 fully developed speckle (complex Gaussian echoes, so a Rayleigh envelope), interfaces add a specular
 echo that grows with the step of acoustic impedance and fades as the beam strikes them obliquely.
-Echoes are attenuated on their way, blurred by a point-spread function that widens away from the
-focus, amplified with depth, log-compressed and scan-converted. Acoustic values follow Szabo,
-"Diagnostic Ultrasound Imaging: Inside Out" (2nd ed., 2014, appendix B), at about 2.5 MHz.
+Echoes lose strength on their way there and back and reverberate between tip and reflectors; they
+are blurred by a point-spread function that widens with depth, drowned in noise, amplified with
+depth, log-compressed and scan-converted. Acoustic values follow Szabo, "Diagnostic Ultrasound
+Imaging: Inside Out" (2nd ed., 2014, appendix B), at 2.5 MHz; losses grow with frequency.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import fft, fftfreq, ifft, next_fast_len
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
+from data_synth.sector import Sector
 from data_synth.tissue import Tissue
 
 Float = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Byte = npt.NDArray[np.uint8]
+
+TABLE_MHZ = 2.5
+"""Frequency of the losses below; they grow with frequency to the power of 1.1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +40,7 @@ class Acoustics:
     """Characteristic impedance."""
 
     attenuation_db_per_cm: float
-    """One-way loss."""
+    """One-way loss at 2.5 MHz."""
 
 
 _BLOOD = Acoustics(-32.0, 1.66, 0.3)
@@ -81,102 +85,90 @@ _SCATTER = 10 ** (_table([a.scatter_db for a in ACOUSTICS.values()]) / 20)
 _IMPEDANCE = _table([a.impedance_mrayl for a in ACOUSTICS.values()])
 _ATTENUATION = _table([a.attenuation_db_per_cm for a in ACOUSTICS.values()])
 
-# The time-gain compensation of a cardiac preset: half blood, half muscle, there and back.
-_COMPENSATION_DB_PER_CM = 1.4
-# An amplifier cannot lift without end: what is below this under muscle's level is noise.
-_NOISE_DB = -44.0
-
-
-@dataclass(frozen=True)
-class Sector:
-    """The fan that a phased array scans, and the picture it is drawn into.
-
-    Transducer frame (mm): origin at the tip, x across the picture, y along the middle beam away
-    from the tip, z across the plane. Pixel ``(i, j)`` is at ``((i - centre) * pixel, j * pixel)``.
-    """
-
-    depth_mm: float
-    angle_deg: float
-    pixel_mm: float
-    beams: int
-    range_step_mm: float = 0.5
-    tip_mm: float = 3.0
-    """Blind range in front of the tip, where the ringing transducer hears nothing."""
-
-    @cached_property
-    def ranges_mm(self) -> Float:
-        """Distances from the tip of the samples along every beam."""
-        return np.arange(self.tip_mm, self.depth_mm + self.range_step_mm, self.range_step_mm)
-
-    @cached_property
-    def angles_rad(self) -> Float:
-        """Angles of the beams off the middle one."""
-        half = np.deg2rad(self.angle_deg) / 2
-        return np.linspace(-half, half, self.beams)
-
-    @cached_property
-    def picture_shape(self) -> tuple[int, int]:
-        """Rows and columns of the picture."""
-        half = self.depth_mm * np.sin(np.deg2rad(self.angle_deg) / 2)
-        return round(self.depth_mm / self.pixel_mm) + 1, 2 * round(half / self.pixel_mm) + 1
-
-    @cached_property
-    def points_mm(self) -> Float:
-        """``(ranges, beams, 3)`` samples in the transducer frame."""
-        across = np.outer(self.ranges_mm, np.sin(self.angles_rad))
-        along = np.outer(self.ranges_mm, np.cos(self.angles_rad))
-        return np.stack([across, along, np.zeros_like(along)], axis=-1)
-
-    @cached_property
-    def transducer_from_image(self) -> Float:
-        """4x4 from pixel ``(i, j, 0)`` to transducer mm."""
-        matrix = np.diag([self.pixel_mm, self.pixel_mm, self.pixel_mm, 1.0])
-        matrix[0, 3] = -(self.picture_shape[1] // 2) * self.pixel_mm
-        return matrix
-
-    @cached_property
-    def _polar_of_pixels(self) -> Float:
-        """``(2, rows, columns)`` fractional range and beam number of every pixel."""
-        rows, columns = self.picture_shape
-        along, across = np.mgrid[0:rows, 0:columns] * self.pixel_mm
-        across -= (columns // 2) * self.pixel_mm
-        sample = (np.hypot(across, along) - self.tip_mm) / self.range_step_mm
-        step = self.angles_rad[1] - self.angles_rad[0]
-        beam = (np.arctan2(across, along) - self.angles_rad[0]) / step
-        return np.stack([sample, beam])
-
-    @cached_property
-    def inside(self) -> npt.NDArray[np.bool_]:
-        """``(rows, columns)`` True for the pixels that the beams reach."""
-        sample, beam = self._polar_of_pixels
-        last = len(self.ranges_mm) - 1
-        heard = (sample >= 0) & (sample <= last) & (beam >= 0) & (beam <= self.beams - 1)
-        return np.asarray(heard)
-
-    def draw(self, polar: Float) -> Byte:
-        """Scan-convert ``(ranges, beams)`` grey values in [0, 255]; 0 outside the fan."""
-        picture = map_coordinates(polar, self._polar_of_pixels, order=1, mode="nearest")
-        grey = np.clip(np.rint(picture), 0, 255)
-        return np.where(self.inside, grey, 0).astype(np.uint8)
-
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """How sharply and how loudly the scanner shows what it hears."""
+    """How sharply and how loudly the scanner shows what it hears.
 
-    pulse_mm: float = 0.55
-    """Standard deviation of the pulse's envelope along the beam."""
+    Widths are standard deviations of Gaussians. An array of width D hears a wavelength L within
+    ``0.51 L / D`` rad (the Gaussian as wide at half height as the sinc of a uniform aperture).
+    """
 
-    beam_rad: float = 0.011
-    """Standard deviation of the beam across, at the focus."""
-
-    aperture_mm: float = 12.0
-    """Width of the array: sets how fast the beam widens off the focus."""
+    frequency_mhz: float = 2.5
+    aperture_mm: float = 20.0
+    """Width of the array within the picture's plane."""
 
     focus_mm: float = 80.0
+    """Range at which the transmitted beam is narrowest; reception is in focus everywhere."""
+
+    slice_aperture_mm: float = 13.0
+    """Width of the array across the picture's plane."""
+
+    slice_focus_mm: float = 75.0
+    """Range of the lens that focuses across the plane, both ways."""
+
     dynamic_range_db: float = 58.0
+    gain_db: float = 0.0
+    compensation_db_per_cm: float | None = None
+    """Time-gain compensation; None: half blood, half muscle, there and back."""
+
+    noise_db: float = -48.0
+    """Level of the amplifier's own noise under that of heart muscle at the tip."""
+
     grey_of_muscle: float = 0.52
-    """Grey value of heart muscle's mean level, as a share of white."""
+    """Grey value of heart muscle's mean level at gain 0, as a share of white."""
+
+    @property
+    def wavelength_mm(self) -> float:
+        """In soft tissue, at 1540 m/s."""
+        return 1.54 / self.frequency_mhz
+
+    @property
+    def pulse_mm(self) -> float:
+        """Standard deviation of the pulse's envelope along the beam: two periods at half height."""
+        return 0.9 * self.wavelength_mm
+
+    @property
+    def loss_scale(self) -> float:
+        """How much more than at the table's frequency is lost on the way."""
+        return float((self.frequency_mhz / TABLE_MHZ) ** 1.1)
+
+    @property
+    def compensation(self) -> float:
+        """dB per cm of range that the amplifier adds."""
+        usual = _USUAL_COMPENSATION * self.loss_scale
+        return usual if self.compensation_db_per_cm is None else self.compensation_db_per_cm
+
+    def beam_rad(self, ranges_mm: Float) -> Float:
+        """Width of the beam there and back, across it within the plane.
+
+        Transmission is diffraction and the cone off the focus (a uniform one of width w has a
+        deviation of w / sqrt(12)); reception opens its aperture with range up to the whole array.
+        """
+        sharp = _SINC * self.wavelength_mm
+        opened_mm = np.minimum(self.aperture_mm, ranges_mm / _F_NUMBER)
+        cone = self.aperture_mm * np.abs(1 / ranges_mm - 1 / self.focus_mm) / np.sqrt(12)
+        sent = np.hypot(sharp / self.aperture_mm, cone)
+        received = sharp / opened_mm
+        return np.asarray(1 / np.hypot(1 / sent, 1 / received))
+
+    def slice_mm(self, ranges_mm: Float) -> Float:
+        """Width of the beam there and back, across the picture's plane: a fixed lens both ways."""
+        far = np.abs(1 / ranges_mm - 1 / self.slice_focus_mm)
+        cone = self.slice_aperture_mm * far / np.sqrt(12)
+        one_way = np.hypot(_SINC * self.wavelength_mm / self.slice_aperture_mm, cone)
+        return np.asarray(ranges_mm * one_way / np.sqrt(2))
+
+
+_SINC = 0.51
+_F_NUMBER = 1.5
+_USUAL_COMPENSATION = 1.5
+# No amplifier lifts without end.
+_LARGEST_LIFT_DB = 70.0
+# Level of a perfect mirror's echo over muscle's speckle; share that the tip throws back again.
+_MIRROR_DB, _TIP_DB = 45.0, -20.0
+# Side lobes: this high, this many times as wide as the beam.
+_SIDE_DB, _SIDE_WIDTH = -40.0, 8.0
 
 
 def bmode(
@@ -185,6 +177,7 @@ def bmode(
     sector: Sector,
     contact_db: Float,
     optics: Optics,
+    scatterers: Complex | None = None,
 ) -> Byte:
     """The picture of the tissues ``labels`` (``(ranges, beams)``) as a scanner shows it.
 
@@ -192,33 +185,69 @@ def bmode(
     ----------
     contact_db
         ``(beams,)`` how much louder or softer each beam is, two-way.
+    scatterers
+        ``(ranges, beams)`` complex echoes of unit mean power after :func:`point_spread`; fresh
+        ones, independent of any other picture, if None.
 
     Returns
     -------
     ``(rows, columns)`` grey values.
     """
-    echo = _scattered(rng, labels) + _specular(rng, labels, sector)
-    echo *= 10 ** ((_path_db(labels, sector) + contact_db) / 20)
-    echo = _blurred(echo, sector, optics)
-    echo += _clutter(rng, sector) + _noise(rng, sector, optics)
-    level_db = 20 * np.log10(np.abs(echo) + 1e-9)
-    muscle = optics.grey_of_muscle
-    grey = 255 * (muscle + level_db / optics.dynamic_range_db)
-    return sector.draw(np.clip(grey, 0, 255))
+    if scatterers is None:
+        scatterers = unit_noise(rng, labels.shape)
+    lines = received(rng, labels, sector, contact_db, optics, scatterers)
+    return sector.draw(compressed(lines, sector, optics))
 
 
-def _unit_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Complex:
+def silence(rng: np.random.Generator, sector: Sector, optics: Optics) -> Byte:
+    """The picture of a probe lifted into air: the tip's own ringing, and noise."""
+    haze = 10 ** (8.0 / 20) * _clutter(rng, sector, optics)
+    # All sound is thrown back at the tip: it echoes in the lens, 6 dB weaker each time.
+    spacing_mm = 5 * optics.wavelength_mm
+    depth_mm = sector.ranges_mm[:, None] - sector.tip_mm
+    rings = 10.0 * np.cos(np.pi * depth_mm / spacing_mm) ** 8 * 0.5 ** (depth_mm / spacing_mm)
+    lines = haze + rings + _noise(rng, sector, optics)
+    return sector.draw(compressed(lines, sector, optics))
+
+
+def received(
+    rng: np.random.Generator,
+    labels: npt.NDArray[np.uint8],
+    sector: Sector,
+    contact_db: Float,
+    optics: Optics,
+    scatterers: Complex,
+) -> Complex:
+    """What the array hears, ``(ranges, beams)``, before any amplifier; muscle at the tip is 1."""
+    echo = _SCATTER[labels] * scatterers + _specular(labels, sector, scatterers)
+    loss_db = path_loss_db(labels, sector, optics)
+    echo = echo * 10 ** ((contact_db - loss_db) / 20)
+    echo = point_spread(echo, sector, optics)
+    echo += _reverberation(echo, sector)
+    return echo + _clutter(rng, sector, optics) + _noise(rng, sector, optics)
+
+
+def compressed(lines: Complex, sector: Sector, optics: Optics) -> Float:
+    """Grey values in [0, 255] of what is heard, amplified with depth and log-compressed."""
+    lift_db = np.minimum(optics.compensation * sector.ranges_mm / 10, _LARGEST_LIFT_DB)
+    level_db = 20 * np.log10(np.abs(lines) + 1e-9) + lift_db[:, None] + optics.gain_db
+    grey = 255 * (optics.grey_of_muscle + level_db / optics.dynamic_range_db)
+    return np.asarray(np.clip(grey, 0, 255))
+
+
+def unit_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Complex:
     """Circular complex Gaussian of unit mean power."""
     real, imaginary = rng.normal(scale=np.sqrt(0.5), size=(2, *shape))
     return np.asarray(real + 1j * imaginary)
 
 
-def _scattered(rng: np.random.Generator, labels: npt.NDArray[np.uint8]) -> Complex:
-    """Echoes of the scatterers too fine to see, unit power in heart muscle."""
-    return np.asarray(_SCATTER[labels] * _unit_noise(rng, labels.shape))
+def path_loss_db(labels: npt.NDArray[np.uint8], sector: Sector, optics: Optics) -> Float:
+    """``(ranges, beams)`` loss on the way there and back."""
+    each = 2 * optics.loss_scale * _ATTENUATION[labels]
+    return np.asarray(np.cumsum(each, axis=0) * sector.range_step_mm / 10)
 
 
-def _specular(rng: np.random.Generator, labels: npt.NDArray[np.uint8], sector: Sector) -> Complex:
+def _specular(labels: npt.NDArray[np.uint8], sector: Sector, scatterers: Complex) -> Complex:
     """Echoes of interfaces: reflection coefficient per mm, times how squarely the beam hits."""
     log_impedance = np.log(_IMPEDANCE)[labels]
     beam_step_rad = sector.angles_rad[1] - sector.angles_rad[0]
@@ -227,35 +256,40 @@ def _specular(rng: np.random.Generator, labels: npt.NDArray[np.uint8], sector: S
     across = np.gradient(smooth, beam_step_rad, axis=1) / sector.ranges_mm[:, None]
     steepness = np.hypot(along, across)
     squareness = np.abs(along) / np.maximum(steepness, 1e-9)
-    # Half the step of log impedance is the reflection coefficient; speckle of muscle is about
-    # 45 dB below a perfect mirror. Rough walls send a tenth of a square hit's echo back anyway.
-    mirror = 10 ** (45 / 20)
+    # Half the step of log impedance is the reflection coefficient. Rough walls send a tenth of a
+    # square hit's echo back anyway.
+    mirror = 10 ** (_MIRROR_DB / 20)
     strength = 0.5 * steepness * mirror * (0.1 + 0.9 * squareness**4)
     # The interface is rough: its echo fluctuates around a steady part.
-    return np.asarray(strength * (0.6 + 0.8 * _unit_noise(rng, labels.shape)))
+    return np.asarray(strength * (0.6 + 0.8 * scatterers))
 
 
-def _path_db(labels: npt.NDArray[np.uint8], sector: Sector) -> Float:
-    """``(ranges, beams)`` gain of the way there and back, after compensation; at most 12 dB up."""
-    excess = 2 * (_ATTENUATION[labels] - _COMPENSATION_DB_PER_CM / 2)
-    path_db = -np.cumsum(excess, axis=0) * sector.range_step_mm / 10
-    return np.asarray(np.clip(path_db, -120.0, 12.0))
-
-
-def _blurred(echo: Complex, sector: Sector, optics: Optics) -> Complex:
+def point_spread(echo: Complex, sector: Sector, optics: Optics) -> Complex:
     """Convolve with the pulse along the beams and with the widening beam across them.
 
-    Unit power stays unit power, so that speckle keeps its level at every depth.
+    White noise of unit power keeps unit power, so that speckle keeps its level at every depth.
     """
     echo = _pulse_filtered(echo, sector, optics)
-    width_rad = _beam_width_rad(sector, optics)
+    width_rad = np.minimum(optics.beam_rad(sector.ranges_mm), 0.15)
     step_rad = sector.angles_rad[1] - sector.angles_rad[0]
-    length = next_fast_len(sector.beams + int(8 * width_rad.max() / step_rad))
+    # Beyond the fan's edges the body goes on: mirrored, so that the edges are not dimmed.
+    margin = min(int(4 * width_rad.max() / step_rad) + 1, sector.beams - 1)
+    wide = np.pad(echo, ((0, 0), (margin, margin)), mode="reflect")
+    length = next_fast_len(wide.shape[1])
     frequency = 2 * np.pi * fftfreq(length, step_rad)
-    transfer = np.exp(-0.5 * (width_rad[:, None] * frequency) ** 2)
-    transfer /= np.sqrt(np.mean(transfer**2, axis=1, keepdims=True))
-    spread = ifft(fft(echo, length, axis=1) * transfer, axis=1)
-    return np.asarray(spread[:, : sector.beams])
+    transfer = _beam_transfer(width_rad[:, None] * frequency)
+    spread = ifft(fft(wide, length, axis=1) * transfer, axis=1)
+    return np.asarray(spread[:, margin : margin + sector.beams])
+
+
+def _beam_transfer(phase: Float) -> Float:
+    """Spectrum of the beam's profile, main lobe and side lobes, that keeps white noise's power.
+
+    ``phase``: ``(ranges, n)`` frequency times width.
+    """
+    side = 10 ** (_SIDE_DB / 20) * _SIDE_WIDTH
+    transfer = np.exp(-0.5 * phase**2) + side * np.exp(-0.5 * (_SIDE_WIDTH * phase) ** 2)
+    return np.asarray(transfer / np.sqrt(np.mean(transfer**2, axis=1, keepdims=True)))
 
 
 def _pulse_filtered(echo: Complex, sector: Sector, optics: Optics) -> Complex:
@@ -264,28 +298,35 @@ def _pulse_filtered(echo: Complex, sector: Sector, optics: Optics) -> Complex:
     blurred = gaussian_filter1d(echo.real, sigma, axis=0) + 1j * gaussian_filter1d(
         echo.imag, sigma, axis=0
     )
-    # The sum of the squares of a sampled Gaussian of unit sum is 1 / (2 sqrt(pi) sigma).
-    return np.asarray(blurred * np.sqrt(2 * np.sqrt(np.pi) * sigma))
+    reach = np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)
+    kernel = np.exp(-0.5 * (reach / sigma) ** 2)
+    return np.asarray(blurred * kernel.sum() / np.sqrt((kernel**2).sum()))
 
 
-def _beam_width_rad(sector: Sector, optics: Optics) -> Float:
-    """``(ranges,)`` standard deviation of the beam: diffraction, and the cone off the focus."""
-    defocus = np.abs(1 / sector.ranges_mm - 1 / optics.focus_mm) * optics.aperture_mm / 4
-    return np.hypot(optics.beam_rad, np.minimum(defocus, 0.15))
+def _reverberation(echo: Complex, sector: Sector) -> Complex:
+    """Echoes that took the way twice, between reflector and tip: at twice the range.
+
+    A reflector as loud as ``echo`` throws back ``echo / mirror`` of what meets it, again.
+    """
+    half = (sector.ranges_mm / 2 - sector.tip_mm) / sector.range_step_mm
+    late = half >= 0
+    first = echo[np.rint(half[late]).astype(int)]
+    twice = np.zeros_like(echo)
+    twice[late] = 10 ** ((_TIP_DB - _MIRROR_DB) / 20) * np.abs(first) * first
+    return twice
 
 
-def _clutter(rng: np.random.Generator, sector: Sector) -> Complex:
-    """Reverberation between tip and skin: a haze that dies out within 20 mm."""
-    fade = 10 ** ((-6 - 1.6 * (sector.ranges_mm - sector.tip_mm)) / 20)
+def _clutter(rng: np.random.Generator, sector: Sector, optics: Optics) -> Complex:
+    """Reverberation between tip and skin: a haze that dies out within some 30 wavelengths."""
+    drop_db_per_mm = 1.6 * optics.frequency_mhz / TABLE_MHZ
+    fade = 10 ** ((-6 - drop_db_per_mm * (sector.ranges_mm - sector.tip_mm)) / 20)
     shape = (len(sector.ranges_mm), sector.beams)
     haze = gaussian_filter(rng.normal(size=shape), (0.8, 6.0), mode="nearest")
     return np.asarray(fade[:, None] * haze / haze.std() + 0j)
 
 
 def _noise(rng: np.random.Generator, sector: Sector, optics: Optics) -> Complex:
-    """Electronic noise, lifted with depth by the compensation."""
+    """The amplifier's own noise, in the pulse's band."""
     shape = (len(sector.ranges_mm), sector.beams)
-    # The gain that compensates attenuation also lifts noise; 20 dB separate tip and bottom.
-    rise_db = _NOISE_DB + 20 * sector.ranges_mm / sector.depth_mm
-    noise = _pulse_filtered(_unit_noise(rng, shape), sector, optics)
-    return np.asarray(10 ** (rise_db / 20)[:, None] * noise)
+    level = 10 ** (optics.noise_db / 20)
+    return np.asarray(level * _pulse_filtered(unit_noise(rng, shape), sector, optics))

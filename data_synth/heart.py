@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -9,11 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.anatomy import BOX_MM, label_points
-from data_synth.beat import Pulse, beat_at, radial_loss
+from data_synth.beat import (
+    PLACES,
+    Amounts,
+    Pulse,
+    beat_at,
+    beat_of,
+    calibrate,
+    check_pulse,
+    end_systole_phase,
+    kick_onset_phase,
+    warp_phase,
+)
 from data_synth.errors import SynthError
-from data_synth.kernels import Beat, Float, Label, Shape, Tubes
+from data_synth.kernels import Float, Label, Shape, Tubes
 from data_synth.meshes import Mesh, enclosed_ml, reference_meshes, tubes_of
-from data_synth.motion import carry_points, reference_points
+from data_synth.motion import Beat, carry_points, reference_points, volume_ratios
 from data_synth.thorax import Thorax, chest_points
 
 Matrix = tuple[tuple[float, ...], ...]
@@ -33,10 +45,14 @@ class BeatingHeart:
     """Rows of the rigid 4x4 (or 3x4) transform from the heart frame to LPS."""
     rr_s: float = 0.8
     """RR interval at which the motion is as ``pulse`` says."""
-    lv_loss: float = field(init=False)
+    amounts: Amounts = field(init=False)
+    """Motions that give the ejection fractions which ``pulse`` asks for."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "lv_loss", radial_loss(self.shape, self.pulse))
+        check_pulse(self.pulse)
+        if not (math.isfinite(self.rr_s) and self.rr_s > 0):
+            raise SynthError(f"RR interval is {self.rr_s} s; give a positive number of seconds")
+        object.__setattr__(self, "amounts", calibrate(self.shape, self.pulse))
 
     @property
     def rotation(self) -> Float:
@@ -59,12 +75,29 @@ class BeatingHeart:
         return tubes_of(self.shape)
 
     def nominal_phase(self, phase: float, rr_s: float) -> float:
-        """Phase of the nominal cycle that a beat of another RR interval shows at ``phase``."""
-        return phase
+        """Phase of the nominal cycle that a beat of another RR interval shows at ``phase``.
+
+        Systole changes with the heart rate as :func:`~data_synth.beat.systole_s` says, the atria
+        contract a fixed time before the next R peak, and diastole takes the rest. Analytic,
+        monotone and cyclic in ``phase``; the identity at the heart's own RR interval.
+
+        Raises
+        ------
+        SynthError
+            When ``rr_s`` is not a positive number.
+        """
+        if not (math.isfinite(rr_s) and rr_s > 0):
+            raise SynthError(f"RR interval is {rr_s} s; give a positive number of seconds")
+        own, rate, usual = self.pulse, 60 / rr_s, 60 / self.rr_s
+        longer = end_systole_phase(rate) / end_systole_phase(usual)
+        later = (1 - kick_onset_phase(rate)) / (1 - kick_onset_phase(usual))
+        end = own.end_systole * longer
+        source = (0.0, end, max(1 - (1 - own.kick_onset) * later, end + 0.05))
+        return warp_phase(phase, source, (0.0, own.end_systole, own.kick_onset))
 
     def beat(self, phase: float) -> Beat:
         """Amounts of motion at a phase."""
-        return beat_at(self.pulse, self.lv_loss, phase)
+        return beat_at(self.shape, self.pulse, self.amounts, phase)
 
     def into_heart(self, points_mm: Float) -> Float:
         """LPS points (n, 3) in the heart frame."""
@@ -83,6 +116,37 @@ class BeatingHeart:
         """Where points (n, 3) at a phase are at the R peak: exact inverse of carry."""
         here = reference_points(self.into_heart(points_mm), self.shape, self.beat(phase))
         return self.into_patient(here)
+
+    def displacement_mm(
+        self, reference_points_mm: Float, phase: float, rr_s: float | None = None
+    ) -> Float:
+        """Way (n, 3) of material points (n, 3), given at the R peak, to where they are then.
+
+        ``phase`` is that of a beat which lasts ``rr_s``, the heart's own RR interval if None.
+        """
+        return self.carry(reference_points_mm, self._nominal(phase, rr_s)) - _points(
+            reference_points_mm
+        )
+
+    def velocity_mm_s(self, points_mm: Float, phase: float, rr_s: float | None = None) -> Float:
+        """Velocity (n, 3), LPS, of the material that is at the points (n, 3) at a phase.
+
+        ``phase`` is that of a beat which lasts ``rr_s``, the heart's own RR interval if None.
+        Five-point differences of :meth:`carry`: good to 0.01 mm/s.
+        """
+        rest = self.reference(points_mm, self._nominal(phase, rr_s))
+        step = 2e-4
+        ahead = [self.carry(rest, self._nominal(phase + k * step, rr_s)) for k in (-2, -1, 1, 2)]
+        slope = (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / (12 * step)
+        return np.asarray(slope / (self.rr_s if rr_s is None else rr_s))
+
+    def volume_ratio(self, reference_points_mm: Float, phase: float) -> Float:
+        """Volume (n,) of tissue at a phase over that at the R peak, where points (n, 3) lie."""
+        here = self.into_heart(reference_points_mm)
+        return volume_ratios(here, self.shape, self.beat(phase))
+
+    def _nominal(self, phase: float, rr_s: float | None) -> float:
+        return phase if rr_s is None else self.nominal_phase(phase, rr_s)
 
     def tissue(self, points_mm: Float, phase: float) -> Label:
         """Tissue value of every LPS point (n, 3): the heart where it is, else the chest."""
@@ -105,7 +169,7 @@ class BeatingHeart:
         return self._near(self.into_heart(points_mm))
 
     def _near(self, here: Float) -> npt.NDArray[np.bool_]:
-        reach = envelope(self.shape, self.pulse, self.lv_loss)
+        reach = envelope(self.shape, self.pulse)
         cell = np.floor((here - _BOX_LOW) / CELL_MM).astype(np.intp)
         inside = ((cell >= 0) & (cell < reach.shape)).all(axis=1)
         i, j, k = cell[inside].T
@@ -143,20 +207,21 @@ def _points(points_mm: Float) -> Float:
 
 
 @lru_cache(maxsize=8)
-def envelope(shape: Shape, pulse: Pulse, lv_loss: float) -> npt.NDArray[np.bool_]:
+def envelope(shape: Shape, pulse: Pulse) -> npt.NDArray[np.bool_]:
     """Cells (x, y, z) of the heart frame's box that the heart touches at some phase.
 
-    Cell centres are looked up at 16 phases; then the set grows by two cells, 10 mm. That covers
-    half a cell's diagonal (4.4 mm) and the way of the fastest point between two of the phases
-    (a descent of 20 mm at 4 descents a cycle for 1/32 of a cycle: 2.5 mm).
+    Cell centres are looked up at 18 places of the cycle; then the set grows by two cells, 10 mm.
+    That covers half a cell's diagonal (4.4 mm) and the way between a place and any instant near
+    it (an eighth of the longest ways, 20 mm down and 20 mm sideways: 3.6 mm).
     """
     from scipy.ndimage import binary_dilation
 
     axes = [np.arange(low, high, CELL_MM) + CELL_MM / 2 for low, high in BOX_MM]
     centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     touched = np.zeros(len(centres), bool)
-    for k in range(16):
-        rest = reference_points(centres, shape, beat_at(pulse, lv_loss, k / 16))
-        touched |= label_points(rest, shape, tubes_of(shape)) > 0
+    for place in PLACES:
+        beat = beat_of(shape, pulse, calibrate(shape, pulse), place)
+        rest = reference_points(centres[~touched], shape, beat)
+        touched[~touched] = label_points(rest, shape, tubes_of(shape)) > 0
     grid = touched.reshape([len(axis) for axis in axes])
     return np.asarray(binary_dilation(grid, np.ones((3, 3, 3), bool), iterations=2))

@@ -27,14 +27,14 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     usual = config.CACHE_DIR
     config.CACHE_DIR = str(Path(usual or Path(__file__).parent / "__pycache__") / _digest())
     try:
-        return cast("Callable[Parameters, Result]", njit(cache=True)(function))
+        return cast("Callable[Parameters, Result]", njit(cache=True, nogil=True)(function))
     finally:
         config.CACHE_DIR = usual
 
 
 @cache
 def _digest() -> str:
-    names = ("kernels", "profiles", "motion", "anatomy", "thorax")
+    names = ("kernels", "primitives", "profiles", "lining", "motion", "anatomy", "thorax")
     sources = [Path(__file__).with_name(f"{name}.py").read_bytes() for name in names]
     return "numba-" + hashlib.sha256(b"".join(sources)).hexdigest()[:12]
 
@@ -80,41 +80,58 @@ class Shape(NamedTuple):
     mitral_radius: float = 15.0
     tricuspid_radius: float = 16.5
     atrial_wall: float = 2.0
-    aorta_radius: float = 13.5
+    vein_radius: float = 5.5
+    """Pulmonary veins where they join the left atrium."""
+    aorta_radius: float = 13.0
+    """Ascending aorta."""
+    sinus_radius: float = 15.5
+    """Aortic root at its widest: the three sinuses of Valsalva."""
     appendage_length: float = 1.0
     """Scale of the finger-like appendage of the left atrium; 1 is about 50 mm along the bend."""
-    appendage_radius: float = 8.0
-    fat_depth: float = 3.0
+    appendage_radius: float = 7.0
+    fat_depth: float = 1.8
     """Fat over the outer surface; the grooves hold more."""
+    pericardium: float = 1.5
+    papillary_radius: float = 5.0
+    trabeculae: float = 4.0
+    """Longest trabeculae of the left apex, mm; the right ventricle's are longer by half."""
+    septal_bulge: float = 0.0
+    """Thickening of the septum into the cavity, mm at its thickest place."""
+    bulge_angle: float = 0.35
+    """Middle of that thickening: the anterior septum."""
+    scar_angle: float = 0.0
+    """Middle of an infarct about the long axis, from +x towards +y."""
+    scar_half_angle: float = 0.0
+    """Half of the angle it takes; 0 for no infarct."""
+    scar_height: float = 0.55
+    """Its middle below the mitral plane, as a share of the cavity's length."""
+    scar_half_height: float = 0.3
+    scar_thinning: float = 0.0
+    """Share of the wall's thickness lost in its middle, on the inside."""
 
 
 class Tubes(NamedTuple):
-    """Centre lines with radii, ``(n, 4)`` rows of x, y, z, radius in the heart frame."""
+    """Centre lines with radii, ``(n, 4)`` rows of x, y, z, radius in the heart frame.
+
+    ``boxes`` holds the low and high corner of each line's tube, ``(fields, 6)``, in field order.
+    """
 
     aorta: Float
     outflow: Float
-    pulmonary: Float
     appendage: Float
-    cava: Float
-
-
-class Beat(NamedTuple):
-    """How much each part has moved at one instant; all zero at the R peak."""
-
-    lv: float
-    """Share of squared cavity radius lost by radial contraction."""
-    rv: float
-    """Share of the right ventricle's cross-section lost."""
-    descent_lv: float
-    """Way of the mitral plane towards the apex, mm."""
-    descent_rv: float
-    """The same of the tricuspid plane, mm."""
-    twist_apex: float
-    """Rotation of the apex about the long axis, radians, from +x towards +y.
-
-    Negative in systole: seen from below, the apex turns counter-clockwise.
-    """
-    twist_base: float
-    la: float
-    """Linear growth of the left atrium, 0 for none."""
-    ra: float
+    veins: Float
+    """``(4, n, 4)``: right upper, right lower, left upper, left lower pulmonary vein."""
+    pulmonary: Float
+    right_branch: Float
+    left_branch: Float
+    upper_cava: Float
+    lower_cava: Float
+    anterolateral: Float
+    """Papillary muscles of the left ventricle, from the wall to the tip."""
+    posteromedial: Float
+    moderator: Float
+    """Band across the right ventricle, from the septum to the free wall."""
+    right_papillary: Float
+    sinuses: Float
+    """``(3, 4)``: middle and radius of each sinus of Valsalva."""
+    boxes: Float

@@ -1,93 +1,59 @@
-"""Cine MR of a beating heart: a short-axis stack as a balanced steady-state sequence sees it."""
+"""Cine MR of a beating heart: short-axis stack, long-axis views and isotropic volume."""
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import gaussian_filter
 
+from data_synth.breathing import BREATHING_AXIS, Breathing, breath_hold_mm
+from data_synth.bssfp import fresh_blood, steady_state_signal
+from data_synth.coils import shading
+from data_synth.flow import plane_inflow, valve_jets
 from data_synth.heart import BeatingHeart
 from data_synth.kernels import Float, Label
-from data_synth.tissue import Tissue, truth_values
+from data_synth.offresonance import off_resonance_hz
+from data_synth.plan import (
+    LONG_AXIS_VIEWS,
+    count_slices,
+    plan_long_axis,
+    plan_stack,
+    plan_volume,
+)
+from data_synth.protocol import MrSettings
+from data_synth.sampling import Slice, SliceView, spread_samples
+from data_synth.tissue import Tissue
+
+__all__ = [
+    "FULL_SCALE",
+    "LONG_AXIS_VIEWS",
+    "MrSettings",
+    "SyntheticCine",
+    "acquire_cine",
+    "acquire_long_axis",
+    "acquire_volume",
+    "add_noise",
+    "count_slices",
+]
 
 Float32 = npt.NDArray[np.float32]
 Int16 = npt.NDArray[np.int16]
 Progress = Callable[[int, int], None]
 
-BLOOD, FLESH = (1441.0, 290.0, 1.0), (1008.0, 44.0, 0.9)
-RELAXATION: dict[Tissue, tuple[float, float, float]] = {
-    Tissue.AIR: (1000.0, 40.0, 0.0),
-    Tissue.FAT: (343.0, 58.0, 0.9),
-    Tissue.MUSCLE: FLESH,
-    Tissue.LUNG: (1200.0, 40.0, 0.17),
-    Tissue.BONE: (549.0, 49.0, 0.6),
-    Tissue.LIVER: (576.0, 46.0, 0.85),
-    Tissue.BLOOD_VESSEL: BLOOD,
-    Tissue.LV_CAVITY: BLOOD,
-    Tissue.LV_MYOCARDIUM: (1030.0, 40.0, 0.95),
-    Tissue.RV_CAVITY: BLOOD,
-    Tissue.RV_WALL: (1030.0, 40.0, 0.95),
-    Tissue.LEFT_ATRIUM: BLOOD,
-    Tissue.RIGHT_ATRIUM: BLOOD,
-    Tissue.ATRIAL_WALL: (1030.0, 40.0, 0.9),
-    Tissue.AORTA: BLOOD,
-    Tissue.VESSEL_WALL: FLESH,
-    Tissue.STOMACH: (900.0, 70.0, 0.8),
-    Tissue.PAPILLARY_MUSCLE: (1030.0, 40.0, 0.95),
-    Tissue.RV_TRABECULA: (1030.0, 40.0, 0.95),
-    Tissue.PERICARDIUM: (1000.0, 20.0, 0.4),
-    Tissue.GAS: (1000.0, 40.0, 0.0),
-    Tissue.SPLEEN: (1057.0, 79.0, 0.85),
-    Tissue.LEAFLET: (1000.0, 25.0, 0.6),
-    Tissue.SCAR: (1100.0, 50.0, 0.95),
-}
-"""T1 (ms), T2 (ms) and proton density (relative) at 1.5 T.
-
-Blood, muscle, heart and liver: Stanisz et al., Magn. Reson. Med. 54:507-512 (2005). Fat and bone
-marrow: de Bazelaire et al., Radiology 230:652-659 (2004). Lung and stomach are set by eye.
-"""
 FULL_SCALE = 2800.0
-"""Stored value of a voxel that gives the sequence's unit signal times ten."""
-
-
-class MrSettings(BaseModel):
-    """How the cine is planned and acquired."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    phases: int = Field(default=25, ge=2, le=100)
-    slices: int | None = Field(default=None, ge=3, le=60)
-    """Number of slices, counted from the apex; by default as many as reach the atrial roof."""
-    slice_thickness_mm: float = Field(default=8.0, gt=0, le=20)
-    slice_gap_mm: float = Field(default=2.0, ge=0, le=20)
-    pixel_mm: float = Field(default=1.4, ge=0.4, le=5)
-    matrix: int = Field(default=192, ge=32, le=512)
-    """Pixels along both sides of an image."""
-    snr: float = Field(default=30.0, gt=0)
-    """Signal of blood over the noise's standard deviation in each channel."""
-    flip_angle_deg: float = Field(default=50.0, gt=0, le=90)
-    repetition_ms: float = Field(default=3.0, gt=0, le=10)
-    coil_shading: float = Field(default=0.25, ge=0, le=1)
-    """Standard deviation, in natural logarithm, of the receive coils' shading across the image."""
-    sharpness_pixels: float = Field(default=0.45, ge=0, le=3)
-    """Standard deviation of the in-plane point spread."""
-    through_plane_samples: int = Field(default=5, ge=1, le=20)
-    window_samples: int = Field(default=1, ge=1, le=9)
-    """Instants averaged over the acquisition window of a frame (one phase step wide)."""
-    breath_hold_shift_mm: float = Field(default=1.5, ge=0, le=10)
-    """Standard deviation of the heart's head-foot place from one slice's breath-hold to another."""
-    planning_error_deg: float = Field(default=3.0, ge=0, le=30)
-    """Standard deviation of the stack's tilt off the heart's short axis."""
+"""Stored value of a voxel that gives the signal of all its protons, M0."""
+THREADS = 4
+"""Most slices that are worked on at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class SyntheticCine:
-    """A short-axis cine with its truth on the same pixels."""
+    """A cine with its truth on the same pixels."""
 
     intensity: Int16
     """``(phase, z, y, x)``."""
@@ -98,7 +64,9 @@ class SyntheticCine:
     rr_ms: Float
     """``(z,)`` RR interval while each slice was acquired."""
     shifts_mm: Float
-    """``(z, 3)`` LPS shift of the patient while each slice was acquired."""
+    """``(z, 3)`` LPS shift of the heart while each slice was acquired."""
+    slice_thickness_mm: float
+    field_strength_t: float
 
     @property
     def phases(self) -> Float:
@@ -110,53 +78,15 @@ class SyntheticCine:
         """``(z, phase)`` times after the R peak."""
         return self.rr_ms[:, None] * self.phases
 
+    @property
+    def pixel_mm(self) -> float:
+        """Distance between pixels, the same along rows and columns."""
+        return float(np.linalg.norm(self.mr_from_index[:3, 0]))
 
-def steady_state_signal(settings: MrSettings) -> Float:
-    """Signal of every tissue in a balanced steady-state sequence, indexed by tissue value.
-
-    M0 sin(a) (1 - E1) / (1 - (E1 - E2) cos(a) - E1 E2) exp(-TE / T2) with E = exp(-TR / T) and
-    TE = TR / 2, on resonance with alternating pulses (Freeman and Hill, J. Magn. Reson.
-    4:366-383, 1971).
-    """
-    t1, t2, density = np.array([RELAXATION[tissue] for tissue in Tissue]).T
-    angle = math.radians(settings.flip_angle_deg)
-    e1, e2 = np.exp(-settings.repetition_ms / t1), np.exp(-settings.repetition_ms / t2)
-    below = 1 - (e1 - e2) * math.cos(angle) - e1 * e2
-    decay = np.exp(-settings.repetition_ms / 2 / t2)
-    return np.asarray(density * math.sin(angle) * (1 - e1) / below * decay)
-
-
-def plan_stack(rng: np.random.Generator, heart: BeatingHeart, settings: MrSettings) -> Float:
-    """Place a short-axis stack as an operator would: 4x4 LPS mm from voxel indices.
-
-    Columns run from the right ventricle to the lateral wall, rows from the anterior wall down,
-    slices from apex to base.
-    """
-    from scipy.spatial.transform import Rotation
-
-    tilt = Rotation.from_rotvec(np.deg2rad(settings.planning_error_deg) * rng.standard_normal(3))
-    axes = tilt.as_matrix() @ heart.rotation @ np.diag([-1.0, -1.0, 1.0])
-    step = settings.slice_thickness_mm + settings.slice_gap_mm
-    apex = -heart.shape.lv_length - heart.shape.apex_wall
-    first = apex + 0.3 * step + rng.uniform(-1, 1)
-    half = (settings.matrix - 1) / 2 * settings.pixel_mm
-    middle = np.array([8.0, 4.0, 0.0]) + np.append(rng.normal(0, 4, 2), 0.0)
-    middle_mm = heart.centre_mm + heart.rotation @ middle
-    corner = middle_mm + axes @ np.array([-half, -half, first])
-    mr_from_index = np.eye(4)
-    mr_from_index[:3, :3] = axes * (settings.pixel_mm, settings.pixel_mm, step)
-    mr_from_index[:3, 3] = corner
-    return mr_from_index
-
-
-def count_slices(heart: BeatingHeart, settings: MrSettings) -> int:
-    """Slices that reach from the apex over the roof of the atria."""
-    if settings.slices is not None:
-        return settings.slices
-    shape = heart.shape
-    roof = max(shape.la_z + shape.la_radius_z, shape.ra_z + shape.ra_radius_z) + 6
-    reach = roof + shape.lv_length + shape.apex_wall
-    return math.ceil(reach / (settings.slice_thickness_mm + settings.slice_gap_mm)) + 1
+    @property
+    def slice_step_mm(self) -> float:
+        """Distance from slice to slice."""
+        return float(np.linalg.norm(self.mr_from_index[:3, 2]))
 
 
 def acquire_cine(
@@ -166,12 +96,12 @@ def acquire_cine(
     settings: MrSettings,
     progress: Progress | None = None,
 ) -> SyntheticCine:
-    """Acquire the stack, slice by slice, one breath-hold each.
+    """Acquire the short-axis stack, slice by slice, one breath-hold each.
 
     Parameters
     ----------
     rng
-        Source of planning error, shifts, shading and noise.
+        Source of planning error, shifts and noise.
     heart
         What is imaged.
     rr_ms
@@ -182,92 +112,219 @@ def acquire_cine(
         Told (slices done, slices in all).
     """
     mr_from_index = plan_stack(rng, heart, settings)
-    count = len(rr_ms)
-    # A diaphragm carries the heart mostly head-foot and somewhat front-back.
-    shifts_mm = settings.breath_hold_shift_mm * rng.standard_normal((count, 1)) * (0.1, -0.3, 1.0)
-    shading = draw_shading(rng, settings)
-    shape = (settings.phases, count, settings.matrix, settings.matrix)
-    intensity, labels = np.empty(shape, np.int16), np.empty(shape, np.uint8)
-    for z in range(count):
-        view = _Slice(heart, settings, mr_from_index, z, shifts_mm[z])
-        for k in range(settings.phases):
-            image, labels[k, z] = view.frame(k / settings.phases)
-            intensity[k, z] = add_noise(rng, image * shading, settings)
-        if progress:
-            progress(z + 1, count)
-    return SyntheticCine(intensity, labels, mr_from_index, np.array(rr_ms, float), shifts_mm)
+    holds = Breathing(hold_sd_mm=settings.breath_hold_shift_mm)
+    shifts_mm = breath_hold_mm(rng, len(rr_ms), holds)
+    frames = [slice_frame(mr_from_index, z) for z in range(len(rr_ms))]
+    images = _acquire_slices(rng, heart, frames, rr_ms, shifts_mm, settings, progress)
+    return _cine(images, mr_from_index, rr_ms, shifts_mm, settings)
 
 
-class _Slice:
-    """One slice, sampled at several depths; the chest around the heart is looked up once."""
+def acquire_long_axis(
+    rng: np.random.Generator,
+    heart: BeatingHeart,
+    rr_ms: Sequence[float],
+    settings: MrSettings,
+    progress: Progress | None = None,
+) -> dict[str, SyntheticCine]:
+    """Acquire the views of LONG_AXIS_VIEWS, one slice and one breath-hold each.
 
-    def __init__(
-        self, heart: BeatingHeart, settings: MrSettings, mr_from_index: Float, z: int, shift: Float
-    ) -> None:
-        self.heart, self.settings = heart, settings
-        self.signal = steady_state_signal(settings).astype(np.float32)
-        self.truth = truth_values()
-        count = settings.through_plane_samples
-        step = settings.slice_thickness_mm + settings.slice_gap_mm
-        depths = ((np.arange(count) + 0.5) / count - 0.5) * settings.slice_thickness_mm / step
-        planes = [(depth, _spot(k)) for k, depth in enumerate(depths)] + [(0.0, (0.0, 0.0))]
-        points = [self._plane(mr_from_index, z + d, spot) - shift for d, spot in planes]
-        self.points = np.concatenate(points)
-        self.rest = heart.chest_tissue(self.points)
-        self.near = np.flatnonzero(heart.near_heart(self.points))
-        self.middle = len(points[0]) * count
-
-    def _plane(self, mr_from_index: Float, z: float, spot: tuple[float, float]) -> Float:
-        y, x = np.mgrid[: self.settings.matrix, : self.settings.matrix].astype(float)
-        index = np.stack([x.ravel() + spot[0], y.ravel() + spot[1], np.full(x.size, z)], axis=1)
-        return np.asarray(index @ mr_from_index[:3, :3].T + mr_from_index[:3, 3])
-
-    def tissue(self, phase: float, near: npt.NDArray[np.intp]) -> Label:
-        """Tissue of all samples, the heart looked up at ``near`` alone."""
-        tissue = self.rest.copy()
-        here = self.heart.heart_tissue(self.points[near], phase)
-        tissue[near] = np.where(here > 0, here, tissue[near])
-        return tissue
-
-    def frame(self, phase: float) -> tuple[Float32, Label]:
-        """Noise-free image and truth labels of one frame, ``(y, x)`` each."""
-        side = self.settings.matrix
-        count = self.settings.window_samples
-        image = np.zeros((side, side), np.float32)
-        for k in range(count):
-            instant = phase + ((k + 0.5) / count - 0.5) / self.settings.phases
-            tissue = self.tissue(instant, self.near)[: self.middle]
-            image += self.signal[tissue].reshape(-1, side, side).mean(axis=0) / count
-        inside = self.near[self.near >= self.middle]
-        labels = self.truth[self.tissue(phase, inside)[self.middle :]].reshape(side, side)
-        blurred = gaussian_filter(image, self.settings.sharpness_pixels, mode="nearest")
-        return blurred, np.asarray(labels)
-
-
-def _spot(k: int) -> tuple[float, float]:
-    """Where in its pixel sample k lies: all depths together cover the pixel evenly.
-
-    Steps of the plastic number's low-discrepancy sequence (Roberts, 2018), centred on the pixel.
+    Parameters
+    ----------
+    rng
+        Source of planning error, shifts and noise.
+    heart
+        What is imaged.
+    rr_ms
+        RR interval (ms) during each of the three views.
+    settings
+        The protocol, the same as the stack's.
+    progress
+        Told (views done, views in all).
     """
-    x, y = (0.7548776662466927 * (k + 1)) % 1, (0.5698402909980532 * (k + 1)) % 1
-    return x - 0.5, y - 0.5
+    frames = [plan_long_axis(rng, heart, view, settings) for view in LONG_AXIS_VIEWS]
+    holds = Breathing(hold_sd_mm=settings.breath_hold_shift_mm)
+    shifts_mm = breath_hold_mm(rng, len(frames), holds)
+    images = _acquire_slices(rng, heart, frames, rr_ms, shifts_mm, settings, progress)
+    return {
+        view: _cine([image], frame, [rr], shift[None], settings)
+        for view, image, frame, rr, shift in zip(
+            LONG_AXIS_VIEWS, images, frames, rr_ms, shifts_mm, strict=True
+        )
+    }
 
 
-def draw_shading(rng: np.random.Generator, settings: MrSettings) -> Float32:
-    """Smooth receive sensitivity over the image, mean 1: exp of a random quadratic."""
-    v, u = np.mgrid[-1 : 1 : settings.matrix * 1j, -1 : 1 : settings.matrix * 1j]
-    terms = np.stack([u, v, u * u, u * v, v * v])
-    field = np.tensordot(rng.standard_normal(5), terms - terms.mean(axis=(1, 2), keepdims=True), 1)
-    sensitivity = np.exp(settings.coil_shading * field / max(float(field.std()), 1e-9))
-    return np.asarray(sensitivity / sensitivity.mean(), dtype=np.float32)
+def acquire_volume(
+    rng: np.random.Generator,
+    heart: BeatingHeart,
+    rr_ms: Sequence[float],
+    settings: MrSettings,
+    progress: Progress | None = None,
+) -> SyntheticCine:
+    """Acquire an isotropic volume over many beats of gated free breathing.
+
+    Blood in so thick a slab is excited wherever it goes, so nothing flows in fresh.
+
+    Parameters
+    ----------
+    rng
+        Source of planning error, breathing and noise.
+    heart
+        What is imaged.
+    rr_ms
+        RR intervals (ms) of the beats; the volume shows their mean, in whole ms.
+    settings
+        The protocol; ``volume_voxel_mm``, ``volume_snr`` and ``volume_gating_mm`` apply.
+    progress
+        Told (planes done, planes in all).
+    """
+    mr_from_index, (depth, rows, columns) = plan_volume(rng, heart, settings)
+    voxel, rr = settings.volume_voxel_mm, float(np.rint(np.mean(rr_ms)))
+    samples = spread_samples(mr_from_index[:3, :3] / voxel, settings, voxel, voxel, 0.0)
+    count = len(samples.instants)
+    breathing = ((rng.permutation(count) + 0.5) / count - 0.5) * settings.volume_gating_mm
+    samples = samples._replace(shifts_mm=np.outer(breathing, BREATHING_AXIS))
+    inflow = plane_inflow(heart, (np.zeros(3), np.eye(3)[2]), 1.0, 1.0, fresh_blood(settings), 0.0)
+    jets = valve_jets(heart) if settings.flow_dephasing > 0 else ()
+    views = [
+        SliceView(
+            slice_frame(mr_from_index, z), (rows, columns), samples, np.zeros(3), rr / 1000,
+            inflow, jets,
+        )
+        for z in range(depth)
+    ]  # fmt: skip
+    images = _acquire(rng, heart, views, settings, settings.volume_snr, progress)
+    still = np.zeros((depth, 3))
+    return _cine(images, mr_from_index, [rr] * depth, still, settings, voxel)
 
 
-def add_noise(rng: np.random.Generator, image: Float32, settings: MrSettings) -> Int16:
+def slice_frame(mr_from_index: Float, z: int) -> Float:
+    """4x4 frame of slice z alone."""
+    frame = mr_from_index.copy()
+    frame[:3, 3] += z * frame[:3, 2]
+    return frame
+
+
+Image = tuple[Int16, Label]
+"""Intensities and labels of one slice, ``(phase, y, x)`` each."""
+
+
+def _acquire_slices(
+    rng: np.random.Generator,
+    heart: BeatingHeart,
+    frames: Sequence[Float],
+    rr_ms: Sequence[float],
+    shifts_mm: Float,
+    settings: MrSettings,
+    progress: Progress | None,
+) -> list[Image]:
+    """Two-dimensional slices with their own profile, inflow and breath-hold."""
+    fresh = fresh_blood(settings)
+    jets = valve_jets(heart) if settings.flow_dephasing > 0 else ()
+    thickness, side = settings.slice_thickness_mm, settings.matrix
+    views = []
+    for frame, rr, shift in zip(frames, rr_ms, shifts_mm, strict=True):
+        axes = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0)
+        samples = spread_samples(axes, settings, thickness, settings.pixel_mm, settings.slice_edge)
+        middle = frame[:3, 3] + frame[:3, :2].sum(axis=1) * (side - 1) / 2 - shift
+        plane = heart.into_heart(middle[None])[0], heart.rotation.T @ axes[:, 2]
+        inflow = plane_inflow(heart, plane, thickness, rr / 1000, fresh, settings.inflow)
+        views.append(SliceView(frame, (side, side), samples, shift, rr / 1000, inflow, jets))
+    return _acquire(rng, heart, views, settings, settings.snr, progress)
+
+
+def _acquire(
+    rng: np.random.Generator,
+    heart: BeatingHeart,
+    views: Sequence[SliceView],
+    settings: MrSettings,
+    snr: float,
+    progress: Progress | None,
+) -> list[Image]:
+    """Frames of all slices; every slice has its own random numbers, whatever the threads do."""
+
+    def work(view: SliceView, own: np.random.Generator) -> Image:
+        return _acquire_slice(own, heart, view, settings, snr)
+
+    # What all slices share is worked out here, so that no two threads do it.
+    off_resonance_hz(heart, settings, heart.centre_mm[None])
+    heart.near_heart(heart.centre_mm[None])
+    images = []
+    with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
+        for image in pool.map(work, views, rng.spawn(len(views))):
+            images.append(image)
+            if progress:
+                progress(len(images), len(views))
+    return images
+
+
+def _acquire_slice(
+    rng: np.random.Generator,
+    heart: BeatingHeart,
+    view: SliceView,
+    settings: MrSettings,
+    snr: float,
+) -> Image:
+    plane = Slice(heart, settings, view)
+    bias = coil_bias(heart, plane.points, view.shape, settings)
+    shape = (settings.phases, *view.shape)
+    intensity, labels = np.empty(shape, np.int16), np.empty(shape, np.uint8)
+    for k in range(settings.phases):
+        image, labels[k] = plane.frame(k / settings.phases)
+        seen = gaussian_filter(image, settings.sharpness_pixels, mode="nearest")
+        intensity[k] = add_noise(rng, seen * bias, settings, snr)
+    return intensity, labels
+
+
+def coil_bias(
+    heart: BeatingHeart, points_mm: Float, shape: tuple[int, int], settings: MrSettings
+) -> Float32:
+    """Coil shading on a slice's pixels (row, column), worked out on every eighth of them."""
+    from scipy.ndimage import map_coordinates
+
+    if settings.coil_shading == 0:
+        return np.ones(shape, np.float32)
+    rows, columns = (np.linspace(0, size - 1, size // 8 + 2) for size in shape)
+    corner = points_mm[0]
+    down = (points_mm[shape[1]] - corner)[None, None]
+    along = (points_mm[1] - corner)[None, None]
+    places = corner + rows[:, None, None] * down + columns[None, :, None] * along
+    coarse = np.log(shading(heart, places.reshape(-1, 3), settings.coil_shading))
+    y, x = np.meshgrid(
+        np.linspace(0, len(rows) - 1, shape[0]),
+        np.linspace(0, len(columns) - 1, shape[1]),
+        indexing="ij",
+    )
+    fine = map_coordinates(coarse.reshape(len(rows), -1), [y, x], order=3, mode="nearest")
+    return np.asarray(np.exp(fine), dtype=np.float32)
+
+
+def add_noise(
+    rng: np.random.Generator, image: npt.NDArray[np.complex64], settings: MrSettings, snr: float
+) -> Int16:
     """Magnitude of the image with complex Gaussian noise (Rician), as stored integers.
 
     Rice distribution: Gudbjartsson and Patz, Magn. Reson. Med. 34:910-914 (1995).
     """
-    deviation = float(steady_state_signal(settings)[Tissue.LV_CAVITY]) / settings.snr
+    deviation = float(abs(steady_state_signal(settings)[Tissue.LV_CAVITY])) / snr
     noise = deviation * rng.standard_normal((2, *image.shape), dtype=np.float32)
-    magnitude = np.hypot(image + noise[0], noise[1])
+    magnitude = np.hypot(image.real + noise[0], image.imag + noise[1])
     return np.asarray(np.clip(np.rint(magnitude * FULL_SCALE), 0, 32767), dtype=np.int16)
+
+
+def _cine(
+    images: Sequence[Image],
+    mr_from_index: Float,
+    rr_ms: Sequence[float],
+    shifts_mm: Float,
+    settings: MrSettings,
+    thickness_mm: float | None = None,
+) -> SyntheticCine:
+    return SyntheticCine(
+        np.stack([intensity for intensity, _ in images], axis=1),
+        np.stack([labels for _, labels in images], axis=1),
+        mr_from_index,
+        np.array(rr_ms, float),
+        shifts_mm,
+        settings.slice_thickness_mm if thickness_mm is None else thickness_mm,
+        settings.field_strength_t,
+    )

@@ -8,11 +8,16 @@ from __future__ import annotations
 import math
 
 from data_synth.kernels import Shape, compiled
+from data_synth.primitives import bump
 
 FLAT = 0.45
 """Above the mitral plane the outline loses at most this share of its squared radius."""
 FULLNESS = 0.35
 """Weight of the fourth power: how blunt the apex is."""
+BULGE_HALF_ANGLE = 1.9
+"""Half of the angle over which a thickened septum fades to the usual wall, radians."""
+BULGE_HEIGHT, BULGE_HALF_HEIGHT = 0.35, 0.8
+"""Its middle and half its height below the mitral plane, as shares of the cavity's length."""
 
 
 @compiled
@@ -45,6 +50,59 @@ def endocardium(z: float, shape: Shape) -> tuple[float, float]:
 
 
 @compiled
+def away_from(angle: float, middle: float) -> float:
+    """Angle from ``middle``, between -pi and pi."""
+    offset = angle - middle
+    return offset - 2 * math.pi * math.floor(offset / (2 * math.pi) + 0.5)
+
+
+@compiled
+def is_round(shape: Shape) -> bool:
+    """Whether the cavity's outline is the same at every angle."""
+    return shape.septal_bulge == 0.0 and shape.scar_thinning == 0.0
+
+
+@compiled
+def scar_share(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
+    """1 in the middle of the infarct, 0 outside; its slopes along z (1/mm) and by angle."""
+    if shape.scar_half_angle <= 0.0:
+        return 0.0, 0.0, 0.0
+    tall = shape.scar_half_height * shape.lv_length
+    turned, by_angle = bump(away_from(angle, shape.scar_angle) / shape.scar_half_angle)
+    along, by_z = bump((z + shape.scar_height * shape.lv_length) / tall)
+    return turned * along, turned * by_z / tall, by_angle * along / shape.scar_half_angle
+
+
+@compiled
+def unevenness(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
+    """Radius of the left cavity over the round one, at an angle about the axis; slopes by z, angle.
+
+    Less than 1 under a thickened septum, more at a thinned scar. The change in millimetres shrinks
+    with the outline towards the apex.
+    """
+    if is_round(shape):
+        return 1.0, 0.0, 0.0
+    scar, scar_z, scar_angle = scar_share(z, angle, shape)
+    tall = BULGE_HALF_HEIGHT * shape.lv_length
+    turned, by_angle = bump(away_from(angle, shape.bulge_angle) / BULGE_HALF_ANGLE)
+    along, by_z = bump((z + BULGE_HEIGHT * shape.lv_length) / tall)
+    inwards = shape.septal_bulge / shape.lv_radius
+    outwards = shape.scar_thinning * shape.lv_wall / shape.lv_radius
+    factor = 1 - inwards * turned * along + outwards * scar
+    factor_z = outwards * scar_z - inwards * turned * by_z / tall
+    return factor, factor_z, outwards * scar_angle - inwards * by_angle * along / BULGE_HALF_ANGLE
+
+
+@compiled
+def endocardium_at(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
+    """Squared radius of the left cavity at an angle about the axis; slopes along z, by angle."""
+    value, slope = endocardium(z, shape)
+    factor, by_z, by_angle = unevenness(z, angle, shape)
+    twice = 2 * value * factor
+    return value * factor * factor, slope * factor * factor + twice * by_z, twice * by_angle
+
+
+@compiled
 def epicardium(z: float, shape: Shape) -> tuple[float, float]:
     """Squared radius of the outside of the left ventricle and its slope along z."""
     widest = -shape.lv_widest * shape.lv_length
@@ -73,6 +131,5 @@ def rv_depth(z: float, shape: Shape) -> tuple[float, float]:
 def rv_share(angle: float, shape: Shape) -> tuple[float, float]:
     """Thickness of the crescent at an angle, 1 in its middle, negative outside; its slope."""
     turn = math.pi / (2 * shape.rv_half_angle)
-    offset = angle - shape.rv_angle
-    offset -= 2 * math.pi * math.floor(offset / (2 * math.pi) + 0.5)
+    offset = away_from(angle, shape.rv_angle)
     return math.cos(turn * offset), -turn * math.sin(turn * offset)

@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from data_synth.ecg import EcgSettings
 from data_synth.errors import SynthError
 from data_synth.mr import MrSettings
 from data_synth.ultrasound import UltrasoundSettings
+
+Pathology = Literal[
+    "healthy",
+    "dilated_cardiomyopathy",
+    "hypertrophic_cardiomyopathy",
+    "rv_dilation",
+    "infarct",
+    "enlarged_atrium",
+]
+
+
+class StudyEcgSettings(EcgSettings):
+    """The ECG of a study: recorded inside the scanner, unless said otherwise."""
+
+    magnetohydrodynamic_mv: float = Field(default=0.5, ge=0, le=5)
+    """Height of the flow artefact in lead II at 1.5 T, in the record made during MR alone."""
 
 
 class PhantomSettings(BaseModel):
@@ -20,16 +36,38 @@ class PhantomSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     seed: int = Field(default=1, ge=0)
+    """From which everything is drawn; patient k of a batch has the first one's seed + k."""
     patient_id: str = Field(default="patient-0001", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    """Name of the study's folder, and PatientID in DICOM."""
+    pathology: Pathology = "healthy"
+    """What ails the heart; with one seed it befalls the same person."""
     spread: float = Field(default=1.0, ge=0, le=2)
     """Width of the population the heart is drawn from: 0 is the mean heart, 1 is nature's."""
     heart_rate_bpm: float = Field(default=75.0, ge=35, le=180)
-    cine: Literal["dicom", "nifti"] = "dicom"
+    """Mean heart rate of both recordings; systole's share of the beat follows it."""
+    cine: Literal["dicom", "enhanced", "nifti"] = "dicom"
+    """Classic single-frame DICOM, Enhanced multi-frame DICOM, or NIfTI."""
+    long_axis: bool = True
+    """Acquire 2-, 3- and 4-chamber views beside the short-axis stack."""
     cine_only: bool = False
     """Leave out ECG and ultrasound."""
     mr: MrSettings = MrSettings()
-    ecg: EcgSettings = EcgSettings(magnetohydrodynamic_mv=0.5)
+    ecg: StudyEcgSettings = StudyEcgSettings()
     ultrasound: UltrasoundSettings = UltrasoundSettings()
+
+    @model_validator(mode="after")
+    def _one_scanner(self) -> Self:
+        """The ECG made during MR is made in the MR's field."""
+        asked, here = self.ecg.field_strength_t, self.mr.field_strength_t
+        if "field_strength_t" not in self.ecg.model_fields_set:
+            ecg = self.ecg.model_copy(update={"field_strength_t": here})
+            object.__setattr__(self, "ecg", ecg)
+        elif asked != here:
+            raise ValueError(
+                f"ecg.field_strength_t = {asked} is not mr.field_strength_t = {here}; "
+                "leave the first out"
+            )
+        return self
 
 
 def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> PhantomSettings:
@@ -49,8 +87,19 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     where = str(path) if path is not None else "settings"
     if not isinstance(content, dict):
         raise SynthError(f"{where}: needs keys and values, such as `spread: 1.0`")
+    return check_settings({**content, **(changes or {})}, where)
+
+
+def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:
+    """Settings from keys and values; ``where`` they come from is named in errors.
+
+    Raises
+    ------
+    SynthError
+        When a key or a value is wrong; all faults are listed.
+    """
     try:
-        return PhantomSettings.model_validate({**content, **(changes or {})})
+        return PhantomSettings.model_validate(content)
     except ValidationError as error:
         raise SynthError(describe(error, where)) from error
 

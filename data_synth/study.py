@@ -4,41 +4,24 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from data_synth.dicom import write_dicom
-from data_synth.ecg import EcgSignal, simulate_ecg, write_wfdb
+from data_synth.ecg import write_wfdb
 from data_synth.errors import SynthError
-from data_synth.heart import BeatingHeart
-from data_synth.kernels import Float
-from data_synth.mr import SyntheticCine, acquire_cine, count_slices
-from data_synth.population import draw_heart
+from data_synth.mr import SyntheticCine
 from data_synth.settings import PhantomSettings
+from data_synth.simulate import Progress, SyntheticStudy, share, simulate_study
 from data_synth.truth import write_json, write_nifti, write_truth
-from data_synth.ultrasound import Sweep, simulate_sweeps, write_sweep
+from data_synth.ultrasound import write_sweep
 
-Progress = Callable[[int, int], None]
-
-BREATH_HOLD_S = 7.0
-"""Time from one slice's acquisition to the next."""
-SWEEP_PAUSE_S = 3.0
-"""Time between two ultrasound sweeps that the recorded ECG has to leave room for."""
-START_MM, START_DEG = 10.0, 10.0
-"""How far the first guess of the tracker's place is from the truth."""
-HEART, MR_ECG, CINE, ULTRASOUND_ECG, ULTRASOUND, START = range(6)
-"""Numbers of the random streams: each part of a study draws from its own."""
-
-
-def stream(settings: PhantomSettings, part: int) -> np.random.Generator:
-    """Random numbers of one part of a study, whatever the other parts draw."""
-    return np.random.default_rng([settings.seed, part])
+PREVIEW = "preview.html"
+"""Name of the page that shows a study, beside its study.yaml."""
 
 
 def write_study(
@@ -46,6 +29,7 @@ def write_study(
     settings: PhantomSettings,
     progress: Progress | None = None,
     overwrite: bool = False,
+    preview: bool = False,
 ) -> None:
     """Write one study into ``folder``, whole or not at all.
 
@@ -59,6 +43,8 @@ def write_study(
         Told (parts done, parts in all).
     overwrite
         Replace what is there once the new study is complete.
+    preview
+        Write ``preview.html`` too, one self-contained page that shows the study.
 
     Raises
     ------
@@ -67,7 +53,13 @@ def write_study(
     """
     require_free(folder, overwrite)
     with publishing(folder) as partial:
-        _write_parts(partial, settings, progress)
+        study = simulate_study(settings, progress, done=65)
+        _write_recordings(partial, study)
+        write_truth(partial / "truth", study, share(progress, 65, 90 if preview else 100))
+        if preview:
+            from data_synth.preview import write_preview
+
+            write_preview(partial / PREVIEW, study)
 
 
 def require_free(folder: Path, overwrite: bool) -> None:
@@ -78,101 +70,50 @@ def require_free(folder: Path, overwrite: bool) -> None:
         raise SynthError(f"{folder}: is no study, so it is not overwritten; choose another folder")
 
 
-def _write_parts(folder: Path, settings: PhantomSettings, progress: Progress | None) -> None:
-    heart = draw_heart(stream(settings, HEART), settings.spread)
-    slices = count_slices(heart, settings.mr)
-    ecg = _ecg(settings, MR_ECG, slices * BREATH_HOLD_S)
-    rr_ms = slice_rr_ms(ecg.r_times_s, slices)
-    cine = acquire_cine(stream(settings, CINE), heart, rr_ms, settings.mr, share(progress, 0, 45))
-    contents: dict[str, Any] = {"patient_id": settings.patient_id}
-    contents["cine"] = _write_cine(folder, settings, cine)
-    truth: dict[str, Any] = {"seed": settings.seed, "settings": settings.model_dump(mode="json")}
-    if not settings.cine_only:
-        write_wfdb(folder / "ecg", "mr", ecg)
-        known, described = _write_ultrasound(folder, settings, heart, share(progress, 45, 75))
-        contents |= {"ecg": {"mr": "ecg/mr", "us": "ecg/us"}, "us": described}
-        truth |= known
-        truth["r_times_s"]["mr"] = ecg.r_times_s.tolist()
-    write_truth(folder / "truth", heart, cine, truth, share(progress, 75, 100))
+def _write_recordings(folder: Path, study: SyntheticStudy) -> None:
+    """Everything that a patient's study holds, and study.yaml that names it."""
+    contents: dict[str, Any] = {"patient_id": study.settings.patient_id}
+    contents["cine"] = _write_cine(folder, study)
+    if study.us_ecg is not None:
+        write_wfdb(folder / "ecg", "mr", study.mr_ecg)
+        write_wfdb(folder / "ecg", "us", study.us_ecg)
+        contents["ecg"] = {"mr": "ecg/mr", "us": "ecg/us"}
+    if study.initial_mr_from_tracker is not None:
+        for sweep in study.sweeps:
+            write_sweep(folder / "us" / f"{sweep.name}.mha", sweep)
+        contents["us"] = {
+            "sweeps": [f"us/{sweep.name}.mha" for sweep in study.sweeps],
+            "initial_mr_from_tracker": study.initial_mr_from_tracker.tolist(),
+        }
     (folder / "study.yaml").write_text(yaml.safe_dump(contents, sort_keys=False))
 
 
-def share(progress: Progress | None, start: int, end: int) -> Progress | None:
-    """Progress of one part, told as the percentage of the whole between ``start`` and ``end``."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(start + (end - start) * done // total, 100)
-
-
-def _ecg(settings: PhantomSettings, part: int, needed_s: float) -> EcgSignal:
-    mean_rr_s = 60 / settings.heart_rate_bpm
-    # Two beats more at each end, for a phase needs an R peak on both sides.
-    duration_s = needed_s + 4 * mean_rr_s
-    # Ultrasound is recorded away from the magnet, where flowing blood makes no voltage.
-    away = {"magnetohydrodynamic_mv": 0.0} if part == ULTRASOUND_ECG else {}
-    ecg = settings.ecg.model_copy(update=away)
-    return simulate_ecg(stream(settings, part), duration_s, mean_rr_s, settings=ecg)
-
-
-def _write_ultrasound(
-    folder: Path, settings: PhantomSettings, heart: BeatingHeart, progress: Progress | None
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Write sweeps and their ECG; entries for truth.json and for study.yaml."""
-    preset = settings.ultrasound
-    run_s = preset.frames / preset.frame_rate_hz
-    ecg = _ecg(settings, ULTRASOUND_ECG, preset.sweeps * (run_s + SWEEP_PAUSE_S))
-    sweeps = simulate_sweeps(stream(settings, ULTRASOUND), heart, ecg.r_times_s, preset, progress)
-    write_wfdb(folder / "ecg", "us", ecg)
-    for sweep in sweeps:
-        write_sweep(folder / "us" / f"{sweep.name}.mha", sweep)
-    mr_from_tracker = sweeps[0].mr_from_tracker
-    start = first_guess(stream(settings, START), mr_from_tracker, heart.centre_mm)
-    known = {
-        "mr_from_tracker": mr_from_tracker.tolist(),
-        "r_times_s": {"us": ecg.r_times_s.tolist()},
-        "us_frames": {sweep.name: _frames(sweep) for sweep in sweeps},
-    }
-    described = {
-        "sweeps": [f"us/{sweep.name}.mha" for sweep in sweeps],
-        "initial_mr_from_tracker": start.tolist(),
-    }
-    return known, described
-
-
-def _frames(sweep: Sweep) -> dict[str, list[float]]:
-    return {"times_s": sweep.times_s.tolist(), "phases": sweep.phases.tolist()}
-
-
-def first_guess(rng: np.random.Generator, mr_from_tracker: Float, centre_mm: Float) -> Float:
-    """A start for registration: the truth turned about the heart's centre, then shifted.
-
-    Turn (10 degrees) and shift (10 mm) have their set size and a random direction.
-    """
-    axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    off = np.eye(4)
-    off[:3, :3] = Rotation.from_rotvec(np.deg2rad(START_DEG) * axis).as_matrix()
-    off[:3, 3] = centre_mm - off[:3, :3] @ centre_mm + START_MM * way
-    return np.asarray(off @ mr_from_tracker)
-
-
-def slice_rr_ms(r_times_s: Float, slices: int) -> list[float]:
-    """RR interval of each slice: the mean while it was acquired, in whole ms as DICOM holds it."""
-    middles = (r_times_s[1:] + r_times_s[:-1]) / 2
-    intervals = np.diff(r_times_s)
-    which = np.clip(middles // BREATH_HOLD_S, 0, slices - 1)
-    return [float(np.rint(1000 * intervals[which == z].mean())) for z in range(slices)]
-
-
-def _write_cine(folder: Path, settings: PhantomSettings, cine: SyntheticCine) -> dict[str, str]:
-    if settings.cine == "dicom":
+def _write_cine(folder: Path, study: SyntheticStudy) -> dict[str, str]:
+    settings = study.settings
+    if settings.cine != "nifti":
         key = f"beatfield-phantom/{settings.patient_id}/{settings.seed}"
-        write_dicom(folder / "cine", settings.patient_id, key, cine, settings.mr)
+        write_dicom(
+            folder / "cine",
+            settings.patient_id,
+            key,
+            study.cine,
+            settings.mr,
+            views=study.views,
+            enhanced=settings.cine == "enhanced",
+        )
         return {"path": "cine"}
-    step_s = float(cine.rr_ms.mean()) / 1000 / len(cine.phases)
-    write_nifti(folder / "cine" / "cine.nii.gz", cine.intensity, cine.mr_from_index, step_s)
-    timing = {"trigger_times_ms": cine.trigger_times_ms.tolist(), "rr_ms": cine.rr_ms.tolist()}
-    write_json(folder / "cine" / "timing.json", timing)
+    _write_cine_nifti(folder / "cine", "cine", "timing", study.cine)
+    # Beside the stack's folder, for that holds one 4D file where nothing names it.
+    for name, view in study.views.items():
+        _write_cine_nifti(folder / "cine" / "long_axis", name, f"{name}_timing", view)
     return {"path": "cine/cine.nii.gz", "timing": "cine/timing.json"}
+
+
+def _write_cine_nifti(folder: Path, name: str, timing_name: str, cine: SyntheticCine) -> None:
+    step_s = float(cine.rr_ms.mean()) / 1000 / len(cine.phases)
+    write_nifti(folder / f"{name}.nii.gz", cine.intensity, cine.mr_from_index, step_s)
+    timing = {"trigger_times_ms": cine.trigger_times_ms.tolist(), "rr_ms": cine.rr_ms.tolist()}
+    write_json(folder / f"{timing_name}.json", timing)
 
 
 @contextmanager

@@ -1,92 +1,45 @@
 """Tracked 2D ultrasound sweeps of the beating heart, as a research tracker would record them.
 
 An operator finds a window onto the heart, points the fan at it and turns it slowly while the heart
-beats. Each frame shows the anatomy at the true phase of its own time. The recorded poses carry the
-tracker's noise; the picture is formed at the true pose.
+beats and the patient holds the breath. Each frame shows the anatomy at the true phase of its own
+time. The picture is formed at the true pose; what is recorded carries the faults of the tracker,
+of the calibration and of the clock, and the truth about each is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import SimpleITK as sitk
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
+from data_synth.breathing import breath_hold_mm, free_breathing_mm
 from data_synth.ecg import phase_at
-from data_synth.echo import ACOUSTICS, Optics, Sector, bmode
+from data_synth.echo import silence
 from data_synth.errors import SynthError
-from data_synth.tissue import Tissue
+from data_synth.probe import EXAMINATIONS, PROBES, Probe
+from data_synth.sector import Sector
+from data_synth.tracker import frozen, off_by, stretch, unsteady
+from data_synth.ultrasound_settings import UltrasoundSettings
+from data_synth.view import View, draw_view, show
+from data_synth.window import Anatomy, aim, sway, sweep_poses
 
 Float = npt.NDArray[np.float64]
 Byte = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
+Progress = Callable[[int, int], None]
 
-_HEART = (
-    Tissue.LV_CAVITY,
-    Tissue.LV_MYOCARDIUM,
-    Tissue.RV_CAVITY,
-    Tissue.RV_WALL,
-    Tissue.LEFT_ATRIUM,
-    Tissue.RIGHT_ATRIUM,
-    Tissue.ATRIAL_WALL,
-)
-
-
-class Anatomy(Protocol):
-    """What a transducer needs to know of the body in front of it."""
-
-    @property
-    def centre_mm(self) -> Float:
-        """``(3,)`` middle of the heart, LPS."""
-
-    @property
-    def long_axis(self) -> Float:
-        """``(3,)`` unit vector from apex to base, LPS."""
-
-    def tissue(self, points_mm: Float, phase: float) -> Byte:
-        """Label of each of ``(n, 3)`` LPS points at one phase."""
-
-
-class UltrasoundSettings(BaseModel):
-    """The scanner's preset, the operator's hand and the tracker's noise."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    sweeps: int = Field(default=2, ge=1, le=3)
-    """Windows used, in this order: apical, posterior (transoesophageal), parasternal."""
-    frames: int = Field(default=40, ge=1)
-    frame_rate_hz: float = Field(default=20.0, gt=0)
-    depth_mm: float = Field(default=150.0, ge=40, le=250)
-    angle_deg: float = Field(default=90.0, ge=20, le=120)
-    pixel_mm: float = Field(default=0.8, gt=0.1, le=3)
-    beams: int = Field(default=128, ge=16)
-    slice_mm: float = Field(default=1.2, ge=0, le=5)
-    """Standard deviation of the beam across the picture's plane: what makes walls fuzzy."""
-    standoff_mm: float = Field(default=8.0, ge=0, le=30)
-    """Depth of the coupling pad between tip and heart; whatever was there is pushed aside."""
-    turn_deg: float = Field(default=110.0, ge=0, le=180)
-    """How far the fan is turned about its middle beam during a sweep."""
-    hand_mm: float = Field(default=2.0, ge=0)
-    """Swing of the hand along each axis."""
-    hand_deg: float = Field(default=2.0, ge=0)
-    """Swing of the hand about each axis."""
-    tracker_mm: float = Field(default=0.2, ge=0)
-    """Standard deviation of a recorded position along each axis."""
-    tracker_deg: float = Field(default=0.1, ge=0)
-    """Standard deviation of a recorded rotation about each axis."""
-    dropout: float = Field(default=0.6, ge=0, le=1)
-    """Chance of each of two wedges of poor contact in a sweep."""
+__all__ = ["Sweep", "UltrasoundSettings", "fitted_probe", "simulate_sweeps", "write_sweep"]
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One recorded run of frames."""
+    """One recorded run of frames, and the truth about it."""
 
     name: str
     """Stem of its file."""
@@ -95,19 +48,46 @@ class Sweep:
     """``(n, rows, columns)`` grey values."""
 
     times_s: Float
-    """``(n,)`` on the clock of the ECG."""
+    """``(n,)`` time stamps as written: the ultrasound's own clock, jitter included."""
 
     phases: Float
-    """``(n,)`` true phase of each frame."""
+    """``(n,)`` true phase of each frame: share of its own RR interval that has passed."""
 
     image_to_probe: Float
-    """4x4 from pixel ``(i, j, 0)`` to mm of the probe's marker."""
+    """4x4 from pixel ``(i, j, 0)`` to mm of the probe's marker, as written."""
 
     probe_to_tracker: Float
-    """``(n, 4, 4)`` as recorded, noise included."""
+    """``(n, 4, 4)`` as recorded, noise and outliers included."""
 
     mr_from_tracker: Float
     """4x4 truth from tracker mm to LPS mm; one for all sweeps of a study."""
+
+    true_times_s: Float
+    """``(n,)`` on the clock of the ECG."""
+
+    nominal_phases: Float
+    """``(n,)`` phase of the nominal cycle that the heart shows: `Anatomy.nominal_phase`."""
+
+    true_image_to_probe: Float
+    """4x4 without the calibration's error."""
+
+    true_probe_to_tracker: Float
+    """``(n, 4, 4)`` without noise and outliers."""
+
+    displacement_mm: Float
+    """``(n, 3)`` shift of the heart by breathing, LPS."""
+
+    clock_offset_s: float
+    """Time stamp less time on the ECG's clock, jitter aside."""
+
+    outlier: Mask
+    """``(n,)`` True where the recorded pose is far off."""
+
+    lost: Mask
+    """``(n,)`` True where the probe was off the body, so that the picture shows nothing."""
+
+    untracked: Mask
+    """``(n,)`` True where the tracker did not see the marker: written as INVALID."""
 
 
 def simulate_sweeps(
@@ -115,26 +95,51 @@ def simulate_sweeps(
     heart: Anatomy,
     r_times_s: Float,
     settings: UltrasoundSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Sweep]:
     """Record every sweep of one study, one after the other, within the span of the R peaks.
+
+    Pictures, tracker and clock draw from streams of their own: a tracker's fault changes no
+    picture.
 
     Raises
     ------
     SynthError
-        When the R peaks span less time than the sweeps need.
+        When the R peaks span less time than the sweeps need, or no heart is in view.
     """
     settings = settings or UltrasoundSettings()
-    starts_s = _start_times(rng, r_times_s, settings)
-    mr_from_tracker = _random_rigid(rng, 400.0)
-    probe_from_transducer = _random_rigid(rng, 60.0)
+    scene, light, faults = rng.spawn(3)
+    starts_s = _start_times(scene, r_times_s, settings)
+    all_times_s = [_frame_times(scene, start_s, settings) for start_s in starts_s]
+    all_moved_mm = _breaths_mm(scene, all_times_s, settings)
+    mr_from_tracker = _random_rigid(scene, 400.0)
+    kits: dict[str, _Kit] = {}
     sweeps = []
-    for number, start_s in enumerate(starts_s):
-        recorder = _Recorder(heart, settings, mr_from_tracker, probe_from_transducer)
-        times_s = _frame_times(rng, start_s, settings)
-        phases = phase_at(times_s, r_times_s)
-        sweeps.append(recorder.sweep(rng, number, times_s, phases, progress))
+    for number, (name, window) in enumerate(EXAMINATIONS[settings.probe][: settings.sweeps]):
+        if name not in kits:
+            kits[name] = _equip(scene, faults, heart, fitted_probe(name, settings), settings)
+        run = _Run(number, window, all_times_s[number], r_times_s, all_moved_mm[number])
+        take = _take(scene, kits[name], run, settings)
+        images = _pictures(light, kits[name].view, take, settings.sweeps, progress)
+        sweeps.append(_recorded(faults, kits[name], mr_from_tracker, take, images, settings))
     return sweeps
+
+
+def fitted_probe(name: str, settings: UltrasoundSettings) -> Probe:
+    """The named probe with the values that the settings ask for."""
+    probe = PROBES[name]
+    sector = replace(probe.sector, **_asked(settings, "depth_mm", "angle_deg", "pixel_mm", "beams"))
+    sound = ("frequency_mhz", "compensation_db_per_cm", "gain_db", "dynamic_range_db")
+    optics = replace(probe.optics, **_asked(settings, *sound))
+    return replace(
+        probe, sector=sector, optics=optics, **_asked(settings, "standoff_mm", "turn_deg")
+    )
+
+
+def _asked(settings: UltrasoundSettings, *names: str) -> dict[str, Any]:
+    """The named settings that are not None."""
+    values = {name: getattr(settings, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def write_sweep(path: Path, sweep: Sweep) -> None:
@@ -150,7 +155,7 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
             "ImageToProbeTransform": _matrix_text(sweep.image_to_probe),
             "ImageToProbeTransformStatus": "OK",
             "ProbeToTrackerTransform": _matrix_text(sweep.probe_to_tracker[number]),
-            "ProbeToTrackerTransformStatus": "OK",
+            "ProbeToTrackerTransformStatus": "INVALID" if sweep.untracked[number] else "OK",
         }
         for key, value in fields.items():
             image.SetMetaData(f"Seq_Frame{number:04d}_{key}", value)
@@ -159,52 +164,137 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Recorder:
-    """Everything that stays the same through one study."""
+class _Kit:
+    """One probe with its marker, used for one or more sweeps."""
 
-    heart: Anatomy
-    settings: UltrasoundSettings
-    mr_from_tracker: Float
+    view: View
     probe_from_transducer: Float
-
-    def sweep(
-        self,
-        rng: np.random.Generator,
-        number: int,
-        times_s: Float,
-        phases: Float,
-        progress: Callable[[int, int], None] | None,
-    ) -> Sweep:
-        """Record one sweep."""
-        settings = self.settings
-        sector = _sector(settings)
-        poses = _hand_motion(rng, _aim(rng, self.heart, number, settings), times_s, settings)
-        contact_db = _contact_db(rng, sector, times_s, settings)
-        images = []
-        for k, (pose, phase) in enumerate(zip(poses, phases, strict=True)):
-            # A beam hears a slice, not a plane: each sample comes from somewhere across it.
-            across_mm = settings.slice_mm * rng.normal(size=sector.points_mm.shape[:2])
-            labels = _labels(
-                self.heart, pose, float(phase), sector, settings.standoff_mm, across_mm
-            )
-            images.append(bmode(rng, labels, sector, contact_db[k], Optics()))
-            if progress:
-                progress(number * len(times_s) + k + 1, settings.sweeps * len(times_s))
-        transducer_from_probe = np.linalg.inv(self.probe_from_transducer)
-        exact = np.linalg.inv(self.mr_from_tracker) @ poses @ transducer_from_probe
-        return Sweep(
-            name=f"sweep_{number:03d}",
-            images=np.stack(images),
-            times_s=times_s,
-            phases=phases,
-            image_to_probe=self.probe_from_transducer @ sector.transducer_from_image,
-            probe_to_tracker=exact @ _tracker_noise(rng, len(times_s), settings),
-            mr_from_tracker=self.mr_from_tracker,
-        )
+    calibration_error: Float
 
 
-def _sector(settings: UltrasoundSettings) -> Sector:
-    return Sector(settings.depth_mm, settings.angle_deg, settings.pixel_mm, settings.beams)
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What is settled before the operator takes up the probe."""
+
+    number: int
+    window: int
+    times_s: Float
+    r_times_s: Float
+    moved_mm: Float
+
+
+@dataclass(frozen=True, slots=True)
+class _Take:
+    """What truly happens during a run."""
+
+    run: _Run
+    phases: Float
+    nominal_phases: Float
+    poses: Float
+    """``(n, 4, 4)`` true ``mr_from_transducer``."""
+
+    lost: Mask
+    contact_db: Float
+    """``(n, beams)``."""
+
+
+def _equip(
+    scene: np.random.Generator,
+    faults: np.random.Generator,
+    heart: Anatomy,
+    probe: Probe,
+    settings: UltrasoundSettings,
+) -> _Kit:
+    """A probe in front of this heart, with a marker fixed to it and calibrated."""
+    return _Kit(
+        draw_view(scene, heart, probe, settings.slice_mm),
+        _random_rigid(scene, 60.0),
+        off_by(faults, settings.calibration_mm, settings.calibration_deg),
+    )
+
+
+def _take(rng: np.random.Generator, kit: _Kit, run: _Run, settings: UltrasoundSettings) -> _Take:
+    """Find the window, move the probe, let the heart beat and the contact come and go."""
+    probe, heart, times_s = kit.view.probe, kit.view.heart, run.times_s
+    start = aim(rng, heart, probe, probe.windows[run.window])
+    poses = sweep_poses(rng, start, times_s, probe, settings.hand_mm, settings.hand_deg)
+    if probe.rides:
+        poses[:, :3, 3] += run.moved_mm
+    phases = phase_at(times_s, run.r_times_s)
+    beat = np.searchsorted(run.r_times_s, times_s, side="right") - 1
+    rr_s = np.diff(run.r_times_s)[beat]
+    nominal = [heart.nominal_phase(float(p), float(rr)) for p, rr in zip(phases, rr_s, strict=True)]
+    lost = stretch(rng, len(times_s), settings.lifted, settings.lifted_frames)
+    contact_db = _contact_db(rng, probe.sector, times_s, settings)
+    return _Take(run, phases, np.array(nominal), poses, lost, contact_db)
+
+
+def _pictures(
+    rng: np.random.Generator, view: View, take: _Take, sweeps: int, progress: Progress | None
+) -> Byte:
+    """``(n, rows, columns)`` pictures of one run."""
+    count = len(take.phases)
+    images = []
+    for k in range(count):
+        if take.lost[k]:
+            images.append(silence(rng, view.probe.sector, view.probe.optics))
+        else:
+            phase, moved_mm = float(take.nominal_phases[k]), take.run.moved_mm[k]
+            images.append(show(rng, view, take.poses[k], phase, moved_mm, take.contact_db[k]))
+        if progress:
+            progress(take.run.number * count + k + 1, sweeps * count)
+    return np.stack(images)
+
+
+def _recorded(
+    rng: np.random.Generator,
+    kit: _Kit,
+    mr_from_tracker: Float,
+    take: _Take,
+    images: Byte,
+    settings: UltrasoundSettings,
+) -> Sweep:
+    """A run as tracker and scanner write it down, and the truth."""
+    run, count = take.run, len(take.phases)
+    transducer_from_probe = np.linalg.inv(kit.probe_from_transducer)
+    exact = np.linalg.inv(mr_from_tracker) @ take.poses @ transducer_from_probe
+    found = exact @ unsteady(rng, count, settings.tracker_mm, settings.tracker_deg)
+    found, outlier = _with_outliers(rng, found, kit.probe_from_transducer, settings)
+    untracked = stretch(rng, count, settings.untracked, settings.untracked_frames)
+    transducer_from_image = kit.view.probe.sector.transducer_from_image
+    calibrated = kit.probe_from_transducer @ kit.calibration_error
+    return Sweep(
+        name=f"sweep_{run.number:03d}",
+        images=images,
+        times_s=run.times_s + settings.clock_offset_s + _jitter_s(rng, count, settings),
+        phases=take.phases,
+        image_to_probe=calibrated @ transducer_from_image,
+        probe_to_tracker=frozen(found, untracked),
+        mr_from_tracker=mr_from_tracker,
+        true_times_s=run.times_s,
+        nominal_phases=take.nominal_phases,
+        true_image_to_probe=kit.probe_from_transducer @ transducer_from_image,
+        true_probe_to_tracker=exact,
+        displacement_mm=run.moved_mm,
+        clock_offset_s=settings.clock_offset_s,
+        outlier=outlier,
+        lost=take.lost,
+        untracked=untracked,
+    )
+
+
+def _with_outliers(
+    rng: np.random.Generator,
+    tracker_from_probe: Float,
+    probe_from_transducer: Float,
+    settings: UltrasoundSettings,
+) -> tuple[Float, Mask]:
+    """Recorded poses, some far off: the probe seems elsewhere, turned about its own tip."""
+    outlier = rng.random(len(tracker_from_probe)) < settings.outliers
+    away = [off_by(rng, settings.outlier_mm, settings.outlier_deg) for _ in outlier]
+    far = probe_from_transducer @ np.stack(away) @ np.linalg.inv(probe_from_transducer)
+    moved = tracker_from_probe @ far
+    return np.where(outlier[:, None, None], moved, tracker_from_probe), outlier
 
 
 def _start_times(
@@ -234,100 +324,31 @@ def _frame_times(rng: np.random.Generator, start_s: float, settings: UltrasoundS
     return np.asarray(start_s + period_s * (np.arange(settings.frames) + unsteady))
 
 
+def _jitter_s(rng: np.random.Generator, count: int, settings: UltrasoundSettings) -> Float:
+    """Error of each time stamp, so small that stamps still rise."""
+    most_s = 0.25 / settings.frame_rate_hz
+    return np.clip(settings.jitter_ms / 1000 * rng.normal(size=count), -most_s, most_s)
+
+
+def _breaths_mm(
+    rng: np.random.Generator, all_times_s: list[Float], settings: UltrasoundSettings
+) -> list[Float]:
+    """``(n, 3)`` shift of the heart in the frames of each sweep."""
+    held_mm = breath_hold_mm(rng, len(all_times_s), settings.breathing)
+    start = rng.random()
+    if settings.breath == "free":
+        return [free_breathing_mm(times_s, settings.breathing, start) for times_s in all_times_s]
+    return [
+        np.tile(held, (len(times_s), 1)) for held, times_s in zip(held_mm, all_times_s, strict=True)
+    ]
+
+
 def _random_rigid(rng: np.random.Generator, reach_mm: float) -> Float:
     """A rotation out of all, and a shift of up to ``reach_mm`` along each axis."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     matrix[:3, 3] = rng.uniform(-reach_mm, reach_mm, 3)
     return matrix
-
-
-def _window_direction(heart: Anatomy, number: int) -> Float:
-    """Unit vector (LPS) from the heart's centre to the window of sweep ``number``."""
-    long_axis = np.asarray(heart.long_axis)
-    left, posterior = np.eye(3)[:2]
-    wanted = (
-        -long_axis,
-        # The oesophagus runs behind the left atrium, to the base side of the middle.
-        posterior + 0.4 * long_axis,
-        -posterior + 0.3 * left,
-    )[number]
-    return np.asarray(wanted / np.linalg.norm(wanted))
-
-
-def _aim(
-    rng: np.random.Generator, heart: Anatomy, number: int, settings: UltrasoundSettings
-) -> Float:
-    """4x4 ``mr_from_transducer`` of the best of the windows near the wanted one."""
-    nominal = _window_direction(heart, number)
-    directions = [nominal]
-    for _ in range(6):
-        about = _unit(np.cross(nominal, _unit(rng.normal(size=3))))
-        directions.append(Rotation.from_rotvec(np.deg2rad(18.0) * about).apply(nominal))
-    poses = [_pose_on(rng, heart, direction, settings) for direction in directions]
-    return max(poses, key=lambda pose: _share_of_heart_heard(heart, pose, settings))
-
-
-def _pose_on(
-    rng: np.random.Generator, heart: Anatomy, direction: Float, settings: UltrasoundSettings
-) -> Float:
-    """A transducer outside the heart in ``direction``, its middle beam on the heart's centre."""
-    reach_mm = np.arange(0.0, 160.0, 1.0)
-    ray_mm = heart.centre_mm + reach_mm[:, None] * direction
-    hits = np.flatnonzero(np.isin(heart.tissue(ray_mm, 0.0), _HEART))
-    if not len(hits):
-        raise SynthError(f"the heart has no tissue on the ray from {heart.centre_mm} mm outwards")
-    pose = np.eye(4)
-    pose[:3, 3] = ray_mm[hits[-1]] + settings.standoff_mm * direction
-    across = _unit(np.cross(direction, _unit(rng.normal(size=3))))
-    pose[:3, :3] = np.stack([across, -direction, np.cross(across, -direction)], axis=1)
-    return pose
-
-
-def _share_of_heart_heard(heart: Anatomy, pose: Float, settings: UltrasoundSettings) -> float:
-    """Share of the samples of two crossed planes that lie in the heart and are not shadowed."""
-    coarse = Sector(settings.depth_mm, settings.angle_deg, 4.0, 24, range_step_mm=2.5)
-    loss = np.array([ACOUSTICS[tissue].attenuation_db_per_cm for tissue in Tissue])
-    heard = []
-    for turn in (0.0, 90.0):
-        turned = pose @ _rigid(np.deg2rad([0.0, turn, 0.0]), np.zeros(3))
-        labels = _labels(heart, turned, 0.0, coarse, settings.standoff_mm)
-        path_db = np.cumsum(2 * loss[labels], axis=0) * coarse.range_step_mm / 10
-        heard.append(np.isin(labels, _HEART) & (path_db < 45.0))
-    return float(np.mean(heard))
-
-
-def _hand_motion(
-    rng: np.random.Generator, start: Float, times_s: Float, settings: UltrasoundSettings
-) -> Float:
-    """``(n, 4, 4)`` true ``mr_from_transducer``: a slow turn about the middle beam, and sway."""
-    passed = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-9)
-    sway = _sway(rng, times_s, 6)
-    rotvec = np.deg2rad(settings.hand_deg * sway[:, :3])
-    shift_mm = settings.hand_mm * sway[:, 3:]
-    # Ease in and out: the hand starts and ends at rest.
-    eased = passed - np.sin(2 * np.pi * passed) / (4 * np.pi)
-    turn = np.deg2rad(settings.turn_deg) * (eased - 0.5)
-    poses = []
-    for k in range(len(times_s)):
-        turned = start @ _rigid(np.array([0.0, turn[k], 0.0]), np.zeros(3))
-        poses.append(turned @ _rigid(rotvec[k], shift_mm[k]))
-    return np.stack(poses)
-
-
-def _sway(rng: np.random.Generator, times_s: Float, channels: int) -> Float:
-    """``(n, channels)`` smooth wander of about unit size: three waves of 0.1 to 1 Hz each."""
-    rates_hz = rng.uniform(0.1, 1.0, (3, channels))
-    phases = rng.uniform(0, 2 * np.pi, (3, channels))
-    waves = np.sin(2 * np.pi * rates_hz * times_s[:, None, None] + phases)
-    return np.asarray(waves.sum(axis=1) * np.sqrt(2 / 3))
-
-
-def _tracker_noise(rng: np.random.Generator, count: int, settings: UltrasoundSettings) -> Float:
-    """``(n, 4, 4)`` small motions of the marker that the tracker wrongly reports."""
-    rotvec = np.deg2rad(settings.tracker_deg) * rng.normal(size=(count, 3))
-    shift_mm = settings.tracker_mm * rng.normal(size=(count, 3))
-    return np.stack([_rigid(r, s) for r, s in zip(rotvec, shift_mm, strict=True)])
 
 
 def _contact_db(
@@ -339,41 +360,9 @@ def _contact_db(
     for _ in range(2):
         centre, width = rng.uniform(angles[0], angles[-1]), rng.uniform(0.04, 0.10)
         depth_db = rng.uniform(8.0, 25.0) * (rng.random() < settings.dropout)
-        drift = centre + 0.08 * _sway(rng, times_s, 1)
+        drift = centre + 0.08 * sway(rng, times_s, 1)
         level_db -= depth_db * np.exp(-0.5 * ((angles - drift) / width) ** 2)
     return np.asarray(level_db)
-
-
-def _labels(
-    heart: Anatomy,
-    mr_from_transducer: Float,
-    phase: float,
-    sector: Sector,
-    standoff_mm: float,
-    across_mm: Float | float = 0.0,
-) -> Byte:
-    """``(ranges, beams)`` tissues in front of a transducer; the coupling pad carries sound well.
-
-    ``across_mm`` ``(ranges, beams)`` shifts each sample out of the picture's plane.
-    """
-    local = sector.points_mm.copy()
-    local[..., 2] += across_mm
-    points_mm = local.reshape(-1, 3) @ mr_from_transducer[:3, :3].T + mr_from_transducer[:3, 3]
-    labels = np.array(heart.tissue(points_mm, phase)).reshape(local.shape[:2])
-    pad = (sector.ranges_mm < standoff_mm)[:, None] & ~np.isin(labels, _HEART)
-    labels[pad] = Tissue.BLOOD_VESSEL
-    return labels
-
-
-def _rigid(rotvec: Float, shift_mm: Float) -> Float:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
-    matrix[:3, 3] = shift_mm
-    return matrix
-
-
-def _unit(vector: Float) -> Float:
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _matrix_text(matrix: Float) -> str:

@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m data_synth.training", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of pool and network")
-    parser.add_argument("--hearts", type=int, default=320, help="hearts in the pool")
+    parser.add_argument("--hearts", type=int, default=180, help="hearts in the pool")
     parser.add_argument("--spread", type=float, default=1.6, help="how far hearts are from mean")
     parser.add_argument("--steps", type=int, default=8_000, help="batches to learn from")
     parser.add_argument("--batch", type=int, default=8, help="images in a batch")

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.heart import BeatingHeart
+from data_synth.pathology import PATHOLOGIES
 from data_synth.population import draw_heart
 
 Float = npt.NDArray[np.float64]
@@ -28,6 +29,10 @@ PLANE_STEP_MM = (2.0, 4.2)
 """Least and largest distance between planes. A slice's neighbour lies three planes away, so
 images are drawn with slices 6 to 12.6 mm apart."""
 
+ILL_SHARE = 0.4
+"""Share of hearts drawn from all pathologies alike; the others are healthy."""
+HEART_RATES_BPM = (50.0, 110.0)
+
 STREAM = 7001
 """Keeps the training hearts apart from those of studies drawn with the same seed."""
 
@@ -36,8 +41,8 @@ STREAM = 7001
 class PoolSettings:
     """How many hearts, how far from the mean, and the seed they come from."""
 
-    hearts: int = 320
-    blocks_per_heart: int = 2
+    hearts: int = 180
+    blocks_per_heart: int = 4
     spread: float = 1.6
     seed: int = 0
 
@@ -115,10 +120,12 @@ def cut_block(heart: BeatingHeart, phase: float, frame: PlaneFrame) -> Label:
 def heart_blocks(number: int, settings: PoolSettings) -> Label:
     """The blocks of one heart, ``(block, plane, row, column)``, whatever other hearts there are."""
     rng = np.random.default_rng([STREAM, settings.seed, number])
-    heart = draw_heart(rng, settings.spread)
+    ill = rng.random() < ILL_SHARE
+    pathology = str(rng.choice(PATHOLOGIES)) if ill else "healthy"
+    heart = draw_heart(rng, settings.spread, pathology, rng.uniform(*HEART_RATES_BPM))
     # Half of the moments are drawn near end-systole, where the cavity is smallest and hardest.
     phases = [
-        rng.uniform(0.0, 1.0) if k % 2 == 0 else rng.normal(0.36, 0.07)
+        rng.uniform(0.0, 1.0) if k % 2 == 0 else rng.normal(heart.pulse.end_systole, 0.07)
         for k in range(settings.blocks_per_heart)
     ]
     return np.stack([cut_block(heart, phase % 1.0, draw_frame(rng, heart)) for phase in phases])

@@ -116,11 +116,17 @@ def _thick_slices(rng: np.random.Generator, planes: Label, contrast: Contrast) -
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
     decor = _Decor(rng, side)
+    mean = contrast.mean.copy()
+    if rng.random() < 0.5:
+        # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
+        mean[Tissue.FAT] *= -1
+    border_px = rng.uniform(0.35, 0.7)
     images = np.empty((3, side, side), np.float32)
     for channel in range(3):
         middle = REACH + NEIGHBOUR * (channel - 1)
         near = planes[middle - 2 : middle + 3]
-        images[channel] = np.tensordot(weights, contrast.mean[near], 1)
+        signed = np.tensordot(weights, mean[near], 1)
+        images[channel] = np.abs(cv2.GaussianBlur(signed, (0, 0), border_px))
         images[channel] += contrast.texture[near[2]] * grain
         decor.paint(images[channel], near[2], contrast)
     return np.maximum(images, 0)

@@ -10,12 +10,20 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32
+from pipeline.imaging.frames import (
+    MIN_PHASES,
+    MIN_SLICES,
+    NEAREST_SLICES_MM,
+    Frame,
+    LeftOut,
+    choose_stack,
+    describe,
+    left_out_lines,
+    slice_positions,
+)
 
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
-
-MIN_SLICES = 3
-MIN_PHASES = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,34 +49,6 @@ class Cine:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One image of one slice at one moment, as a file gave it."""
-
-    where: str
-    """The file (and frame number) that it came from, for messages."""
-
-    pixels: Float32
-    """``(row, column)``."""
-
-    position_mm: Float
-    """LPS position of the first pixel's centre."""
-
-    axes: Float
-    """``(2, 3)`` unit vectors: the direction in which columns count up, then rows."""
-
-    spacing_mm: tuple[float, float]
-    """Distance between pixel centres from column to column, then from row to row."""
-
-    trigger_time_ms: float
-    rr_ms: float
-
-    @property
-    def normal(self) -> Float:
-        """Unit normal of the slice, right-handed."""
-        return np.asarray(np.cross(self.axes[0], self.axes[1]))
-
-
-@dataclass(frozen=True, slots=True)
 class Stack:
     """A cine with what the reader noticed on the way."""
 
@@ -81,37 +61,47 @@ class Stack:
 
     timing_source: str
     left_out: tuple[str, ...]
-    """Images that are not part of the stack, such as long-axis views, each with its reason."""
+    """What is not part of the stack, such as long-axis views: a line a series, with the reason."""
 
 
-def stack_frames(frames: Sequence[Frame], timing_source: str, where: str) -> Stack:
-    """Sort frames along the slice normal, then by trigger time, into one regular stack.
+def stack_frames(
+    frames: Sequence[Frame],
+    where: str,
+    rr_source: str | None = None,
+    others: Sequence[LeftOut] = (),
+) -> Stack:
+    """Sort images, in any order, into one regular stack.
 
-    The stack is the largest set of parallel slices; slices of another orientation are listed in
-    ``left_out``.
+    Images that are not of the stack, such as long-axis views, are listed in ``left_out``, a line
+    a series (``pipeline.imaging.frames.choose_stack`` says which those are).
+
+    Parameters
+    ----------
+    rr_source
+        Where the RR interval comes from when the files do not tell it.
+    others
+        What was no image of a slice; it is listed with the rest in ``left_out``.
 
     Raises
     ------
     InputError
-        When matrix or pixel spacing differ, a slice or a phase is missing or given twice, there
-        are fewer than 3 slices or 2 phases, or the timing is not that of one heartbeat.
+        When matrix, pixel spacing or direction differ, a slice or a phase is missing or given
+        twice, there are fewer than 3 slices or 2 phases, or the timing is not that of one
+        heartbeat.
     """
-    parallel, left_out = _largest_parallel_set(frames)
-    _require_same_pixels(parallel, where)
-    slices = _slices_in_order(parallel, where)
+    chosen, left_out = choose_stack(frames, where)
+    _require_timing(chosen)
+    slices, time_name = _in_time(_slices_in_order(chosen), where)
+    _require_complete(slices, where)
     step_mm = _require_regular_steps(slices, where)
-    triggers = np.array([[frame.trigger_time_ms for frame in one] for one in slices])
-    rr_ms = np.array([np.mean([frame.rr_ms for frame in one]) for one in slices])
+    triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
+    rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
     phases = common_phases(triggers, rr_ms, where)
-    first = slices[0][0]
-    mr_from_index = np.eye(4)
-    mr_from_index[:3, 0] = first.axes[0] * first.spacing_mm[0]
-    mr_from_index[:3, 1] = first.axes[1] * first.spacing_mm[1]
-    mr_from_index[:3, 2] = step_mm
-    mr_from_index[:3, 3] = first.position_mm
-    intensity = np.stack([[frame.pixels for frame in one] for one in slices], axis=1)
-    cine = Cine(intensity.astype(np.float32), mr_from_index, phases, float(rr_ms.mean()) / 1000)
-    return Stack(cine, triggers, rr_ms, timing_source, left_out)
+    mr_from_index = _placement(slices[0][0], step_mm)
+    cine = Cine(_intensity(slices), mr_from_index, phases, float(rr_ms.mean()) / 1000)
+    source = rr_source or f"DICOM {time_name} and RR interval"
+    lines = left_out_lines([*left_out, *others], where)
+    return Stack(cine, triggers, rr_ms, source, lines)
 
 
 def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
@@ -158,61 +148,122 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     return np.asarray(common)
 
 
-def _largest_parallel_set(frames: Sequence[Frame]) -> tuple[list[Frame], tuple[str, ...]]:
-    groups: list[list[Frame]] = []
+def _require_timing(frames: Sequence[Frame]) -> None:
     for frame in frames:
-        for group in groups:
-            if abs(float(group[0].normal @ frame.normal)) > np.cos(np.radians(1)):
-                group.append(frame)
-                break
-        else:
-            groups.append([frame])
-    groups.sort(key=len, reverse=True)
-    left_out = tuple(
-        f"{frame.where}: not parallel to the stack" for group in groups[1:] for frame in group
-    )
-    return groups[0], left_out
-
-
-def _require_same_pixels(frames: Sequence[Frame], where: str) -> None:
-    first = frames[0]
-    for frame in frames:
-        if frame.pixels.shape != first.pixels.shape:
+        if not frame.times_ms:
             raise InputError(
-                f"{where}: slices have different matrices: {first.where} has "
-                f"{first.pixels.shape}, {frame.where} has {frame.pixels.shape} (rows, columns); "
-                "give one stack of one matrix"
+                f"{frame.where}: has no trigger time; export the cine with TriggerTime "
+                "(0018,1060), or give it as NIfTI with a timing file"
             )
-        if not np.allclose(frame.spacing_mm, first.spacing_mm, rtol=1e-3):
-            raise InputError(
-                f"{where}: slices have different pixel spacing: {first.where} has "
-                f"{first.spacing_mm} mm, {frame.where} has {frame.spacing_mm} mm; "
-                "give one stack of one spacing"
-            )
+        _rr_ms(frame)
 
 
-def _slices_in_order(frames: Sequence[Frame], where: str) -> list[list[Frame]]:
-    normal = frames[0].normal
-    along_mm = np.array([frame.position_mm @ normal for frame in frames])
-    order = np.argsort(along_mm, kind="stable")
-    slices: list[list[Frame]] = []
-    last_mm = -np.inf
-    for number in order:
-        # Positions are written with few decimals; slices are never closer than half a millimetre.
-        if along_mm[number] - last_mm > 0.5:
-            slices.append([])
-        slices[-1].append(frames[number])
-        last_mm = along_mm[number]
-    for one in slices:
-        one.sort(key=lambda frame: frame.trigger_time_ms)
-        for earlier, later in pairwise(one):
-            if later.trigger_time_ms == earlier.trigger_time_ms:
-                raise InputError(
-                    f"{where}: {earlier.where} and {later.where} show the same slice at the same "
-                    f"trigger time {later.trigger_time_ms:g} ms; keep one series a slice"
-                )
-    _require_complete(slices, where)
+def _rr_ms(frame: Frame) -> float:
+    if frame.rr_ms is None:
+        raise InputError(
+            f"{frame.where}: has no RR interval (NominalInterval (0018,1062) or HeartRate "
+            "(0018,1088)); give cine.rr_ms in study.yaml"
+        )
+    return frame.rr_ms
+
+
+def _slices_in_order(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Frames by slice, the slices in order along the normal."""
+    along_mm = np.array([float(frame.middle_mm @ frames[0].normal) for frame in frames])
+    starts_mm = slice_positions(frames)
+    # Half the least distance of two slices: rounded positions fall on the right side.
+    which = np.searchsorted(starts_mm - NEAREST_SLICES_MM / 2, along_mm) - 1
+    slices: list[list[Frame]] = [[] for _ in starts_mm]
+    for frame, number in zip(frames, which, strict=True):
+        slices[number].append(frame)
     return slices
+
+
+def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[Frame]], str]:
+    """Each slice sorted by the first attribute that tells all of its frames apart."""
+    names = _shared_time_names(slices, where)
+    for name in names:
+        ordered = _sorted_by(slices, name)
+        if not any(_tie(one, name) for one in ordered):
+            break
+    else:
+        name = names[0]
+        ordered = _sorted_by(slices, name)
+    _require_given_once(ordered, name, where)
+    for tie in (_tie(one, name) for one in ordered):
+        if tie:
+            raise InputError(
+                f"{where}: {tie[0].where} and {tie[1].where} show the same slice at the same "
+                f"trigger time {tie[0].times_ms[name]:g} ms; keep one series a slice"
+            )
+    return ordered, name
+
+
+def _sorted_by(slices: Sequence[Sequence[Frame]], name: str) -> list[list[Frame]]:
+    return [sorted(one, key=lambda frame: frame.times_ms[name]) for one in slices]
+
+
+def _shared_time_names(slices: Sequence[Sequence[Frame]], where: str) -> list[str]:
+    """The attributes that time every frame, the most trusted first."""
+    first = slices[0][0]
+    names = list(first.times_ms)
+    for frame in (frame for one in slices for frame in one):
+        names = [name for name in names if name in frame.times_ms]
+        if not names:
+            raise InputError(
+                f"{where}: {first.where} is timed by {', '.join(first.times_ms)}, "
+                f"{frame.where} by {', '.join(frame.times_ms)}; export all images in one way"
+            )
+    return names
+
+
+def _tie(ordered: Sequence[Frame], name: str) -> tuple[Frame, Frame] | None:
+    for earlier, later in pairwise(ordered):
+        if later.times_ms[name] == earlier.times_ms[name]:
+            return earlier, later
+    return None
+
+
+def _require_given_once(slices: Sequence[Sequence[Frame]], name: str, where: str) -> None:
+    """Refuse a slice that two series show over the same part of the heartbeat."""
+    for number, one in enumerate(slices):
+        by_series: dict[str, list[Frame]] = {}
+        for frame in one:
+            by_series.setdefault(frame.series_uid, []).append(frame)
+        spans = sorted(
+            (found for found in by_series.values() if len(found) >= MIN_PHASES),
+            key=lambda found: (found[0].times_ms[name], found[0].series),
+        )
+        for first, second in pairwise(spans):
+            if second[0].times_ms[name] < first[-1].times_ms[name]:
+                raise InputError(
+                    f"{where}: slice {number} is given twice: by {first[0].series}, "
+                    f"{_images(first)}, and by {second[0].series}, {_images(second)}, which "
+                    "show the same trigger time or overlap; keep one series a slice"
+                )
+
+
+def _images(frames: Sequence[Frame]) -> str:
+    return describe([frame.where for frame in frames])
+
+
+def _intensity(slices: Sequence[Sequence[Frame]]) -> Float32:
+    """All pixels as ``(phase, z, y, x)``, without a second copy on the way."""
+    shape = (len(slices[0]), len(slices), *slices[0][0].pixels.shape)
+    intensity = np.empty(shape, np.float32)
+    for z, one in enumerate(slices):
+        for k, frame in enumerate(one):
+            intensity[k, z] = frame.pixels
+    return intensity
+
+
+def _placement(first: Frame, step_mm: Float) -> Float:
+    mr_from_index = np.eye(4)
+    mr_from_index[:3, 0] = first.axes[0] * first.spacing_mm[0]
+    mr_from_index[:3, 1] = first.axes[1] * first.spacing_mm[1]
+    mr_from_index[:3, 2] = step_mm
+    mr_from_index[:3, 3] = first.position_mm
+    return mr_from_index
 
 
 def _require_complete(slices: Sequence[Sequence[Frame]], where: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,32 @@ import pydicom
 from pydicom.errors import InvalidDicomError
 
 from pipeline.errors import InputError
-from pipeline.imaging.cine import Frame, Stack, stack_frames
+from pipeline.geometry import Float
+from pipeline.imaging.cine import Stack, stack_frames
+from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame, LeftOut, left_out_lines
+
+Groups = Callable[[str], Any]
+"""One frame's functional group by name; the whole object for a classic image."""
 
 NOT_IMAGES = {"DICOMDIR"}
 
 
+MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
+MR_CLASSES = {
+    MR_IMAGE: "MR Image Storage",
+    "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
+    "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
+}
+TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
+"""The same moment in classic and in Enhanced objects."""
+PHASE_IMAGES = {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"}
+
+
 def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
-    """Read every DICOM file below ``folder`` as one cine stack.
+    """Read every DICOM file below ``folder``, classic or Enhanced, as one cine stack.
+
+    The folder may hold other images too (long-axis views, localisers, derived images, reports):
+    they are listed in the stack's ``left_out``.
 
     Parameters
     ----------
@@ -27,8 +46,8 @@ def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
     Raises
     ------
     InputError
-        When a file is not readable or truncated, has no trigger time or no place in space, or
-        the frames do not make up a regular stack.
+        When a file is not readable or truncated, an MR image has no place in space, the stack's
+        images have no trigger time, or they do not make up a regular stack.
     """
     paths = sorted(
         path
@@ -37,108 +56,199 @@ def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
     )
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
-    frames = [frame for path in paths for frame in _read_frames(path, rr_ms)]
-    source = "study.yaml" if rr_ms is not None else "DICOM trigger time and RR interval"
-    return stack_frames(frames, source, str(folder))
+    frames: list[Frame] = []
+    others: list[LeftOut] = []
+    for path in paths:
+        dataset = _read(path)
+        other = _other_object(dataset)
+        if other:
+            uid = str(dataset.get("SeriesInstanceUID", ""))
+            others.append(LeftOut(str(path), _series_name(dataset), uid, other, "object"))
+        else:
+            frames += _read_frames(dataset, path, rr_ms)
+    if not frames:
+        found = "; ".join(left_out_lines(others, str(folder)))
+        raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
+    return stack_frames(frames, str(folder), None if rr_ms is None else "study.yaml", others)
 
 
-def _read_frames(path: Path, rr_ms: float | None) -> Iterator[Frame]:
+def _read(path: Path) -> Any:
     try:
-        dataset = pydicom.dcmread(path)
+        return pydicom.dcmread(path)
     except (InvalidDicomError, EOFError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: cannot be read as DICOM ({error}); copy it again from the scanner"
         ) from error
-    _require_image(dataset, path)
-    pixels = _pixels(dataset, path)
-    if "PerFrameFunctionalGroupsSequence" in dataset:
-        yield from _enhanced_frames(dataset, pixels, path, rr_ms)
-    else:
-        yield _frame(str(path), pixels[0], dataset, dataset, dataset, dataset, rr_ms)
 
 
-def _require_image(dataset: Any, path: Path) -> None:
+def _other_object(dataset: Any) -> str | None:
+    """What the object is, when it is known to be something else than an image of a slice."""
+    sop_class = str(dataset.get("SOPClassUID", "") or MR_IMAGE)
+    if sop_class in MR_CLASSES:
+        return None
+    name = pydicom.uid.UID(sop_class).name
+    if "PixelData" not in dataset:
+        return f"{name}, no image"
+    if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
+        return f"{name}, in colour"
+    placed = "ImagePositionPatient" in dataset or "PerFrameFunctionalGroupsSequence" in dataset
+    return None if placed else f"{name}, without a place in space"
+
+
+def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
     if "PixelData" not in dataset or "Rows" not in dataset:
         raise InputError(
             f"{path}: holds no image (truncated, or not an image object); "
             "copy it again, or take it out of the cine folder"
         )
+    pixels = _pixels(dataset, path)
+    if "PerFrameFunctionalGroupsSequence" not in dataset:
+        return [_frame(str(path), pixels[0], dataset, lambda _: dataset, rr_ms)]
+    own_groups = dataset.PerFrameFunctionalGroupsSequence
+    if len(own_groups) != len(pixels):
+        raise InputError(
+            f"{path}: has {len(pixels)} frames of pixels and {len(own_groups)} descriptions of "
+            "frames; copy it again from the scanner"
+        )
+    shared = (dataset.get("SharedFunctionalGroupsSequence") or [pydicom.Dataset()])[0]
+    return [
+        _frame(f"{path} frame {k + 1}", pixels[k], dataset, _groups(shared, own), rr_ms)
+        for k, own in enumerate(own_groups)
+    ]
+
+
+def _groups(shared: Any, own: Any) -> Groups:
+    """Functional groups of one frame by name: its own before those of all frames."""
+
+    def group(name: str) -> Any:
+        return (own.get(name) or shared.get(name) or [pydicom.Dataset()])[0]
+
+    return group
 
 
 def _pixels(dataset: Any, path: Path) -> Any:
-    """Stored values times slope plus intercept, ``(frame, row, column)``."""
+    """Stored values, ``(frame, row, column)``."""
     try:
         stored = dataset.pixel_array
     except Exception as error:  # pydicom's decoders raise many kinds for damaged pixel data
         raise InputError(
-            f"{path}: its pixels cannot be read, the file is truncated or damaged ({error}); "
-            "copy it again from the scanner"
+            f"{path}: its pixels cannot be read, the file is truncated, damaged or compressed in "
+            f"a way not known here ({error}); copy it again from the scanner, uncompressed"
         ) from error
-    frames = stored.reshape(-1, int(dataset.Rows), int(dataset.Columns)).astype(np.float32)
-    slope = np.float32(dataset.get("RescaleSlope", 1) or 1)
-    return frames * slope + np.float32(dataset.get("RescaleIntercept", 0) or 0)
+    if stored.size != max(int(dataset.get("NumberOfFrames", 1) or 1), 1) * dataset.Rows * (
+        dataset.Columns
+    ):
+        raise InputError(f"{path}: is in colour; the cine needs grey images")
+    return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
 
 
-def _enhanced_frames(dataset: Any, pixels: Any, path: Path, rr_ms: float | None) -> Iterator[Frame]:
-    shared = dataset.get("SharedFunctionalGroupsSequence", [pydicom.Dataset()])[0]
-    for number, own in enumerate(dataset.PerFrameFunctionalGroupsSequence):
-
-        def group(name: str, own: Any = own) -> Any:
-            items = own.get(name) or shared.get(name) or [pydicom.Dataset()]
-            return items[0]
-
-        yield _frame(
-            f"{path} frame {number + 1}",
-            pixels[number],
-            group("PlanePositionSequence"),
-            group("PlaneOrientationSequence"),
-            group("PixelMeasuresSequence"),
-            group("CardiacSynchronizationSequence"),
-            rr_ms,
-        )
-
-
-def _frame(
-    where: str,
-    pixels: Any,
-    position: Any,
-    orientation: Any,
-    measures: Any,
-    timing: Any,
-    rr_ms: float | None,
-) -> Frame:
-    place = position.get("ImagePositionPatient")
-    axes = orientation.get("ImageOrientationPatient")
-    spacing = measures.get("PixelSpacing")
-    if place is None or axes is None or spacing is None:
+def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None) -> Frame:
+    place = group("PlanePositionSequence").get("ImagePositionPatient")
+    axes = group("PlaneOrientationSequence").get("ImageOrientationPatient")
+    spacing = group("PixelMeasuresSequence").get("PixelSpacing")
+    if not place or not axes or not spacing:
         raise InputError(
             f"{where}: has no ImagePositionPatient, ImageOrientationPatient or PixelSpacing; "
             "export the original images, not screen captures"
         )
-    trigger = timing.get("TriggerTime", timing.get("NominalCardiacTriggerDelayTime"))
-    if trigger is None:
-        raise InputError(
-            f"{where}: has no trigger time; export the cine with TriggerTime (0018,1060), or "
-            "give it as NIfTI with a timing file"
+    try:
+        timing = group("CardiacSynchronizationSequence")
+        own_rr_ms = _rr_ms(timing, dataset) if rr_ms is None else rr_ms
+        position_mm, directions, spacing_mm = _geometry(place, axes, spacing)
+        return Frame(
+            where=where,
+            pixels=_rescaled(pixels, group("PixelValueTransformationSequence")),
+            position_mm=position_mm,
+            axes=directions,
+            spacing_mm=spacing_mm,
+            times_ms=_times_ms(timing, own_rr_ms),
+            rr_ms=own_rr_ms,
+            series=_series_name(dataset),
+            series_uid=str(dataset.get("SeriesInstanceUID", "")),
+            kind=_kind(dataset, group("MRImageFrameTypeSequence")),
         )
-    return Frame(
-        where=where,
-        pixels=pixels,
-        position_mm=np.array(place, dtype=float),
-        axes=np.array(axes, dtype=float).reshape(2, 3),
-        spacing_mm=(float(spacing[1]), float(spacing[0])),
-        trigger_time_ms=float(trigger),
-        rr_ms=_rr_ms(timing, where) if rr_ms is None else rr_ms,
-    )
+    except (ValueError, TypeError, IndexError) as error:
+        raise InputError(
+            f"{where}: a value in its header cannot be understood ({error}); "
+            "copy it again from the scanner"
+        ) from error
 
 
-def _rr_ms(timing: Any, where: str) -> float:
-    for name in ("NominalInterval", "RRIntervalTimeNominal"):
-        if timing.get(name):
-            return float(timing.get(name))
-    if timing.get("HeartRate"):
-        return 60000 / float(timing.HeartRate)
-    raise InputError(
-        f"{where}: has no RR interval (NominalInterval (0018,1062) or HeartRate (0018,1088)); "
-        "give cine.rr_ms in study.yaml"
-    )
+def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[float, float]]:
+    """Position, directions of columns and rows, and pixel spacing along these.
+
+    Raises
+    ------
+    ValueError
+        When they are not three, six and two finite numbers, or place no right-angled image.
+    """
+    position_mm = np.array(place, dtype=float).reshape(3)
+    directions = np.array(axes, dtype=float).reshape(2, 3)
+    along_row, along_column = (float(value) for value in np.array(spacing, float).reshape(2)[::-1])
+    if not np.allclose(directions @ directions.T, np.eye(2), atol=5e-3):
+        raise ValueError(f"ImageOrientationPatient {directions.ravel().tolist()}")
+    if not (np.isfinite(position_mm).all() and 0 < min(along_row, along_column) < np.inf):
+        raise ValueError(f"position {position_mm.tolist()} and PixelSpacing {list(spacing)}")
+    return position_mm, directions, (along_row, along_column)
+
+
+def _rescaled(pixels: Any, transformation: Any) -> Any:
+    """Stored values times slope plus intercept."""
+    slope = float(transformation.get("RescaleSlope", 1) or 1)
+    intercept = float(transformation.get("RescaleIntercept", 0) or 0)
+    if (slope, intercept) == (1, 0):
+        return pixels
+    return pixels.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+
+
+def _times_ms(timing: Any, rr_ms: float | None) -> dict[str, float]:
+    """What tells the frame's moment, the most trusted first.
+
+    The trigger time comes first; where it does not tell frames apart, the actual delay or the
+    percentage of the cycle may.
+    """
+    times: dict[str, float] = {}
+    trigger = next((name for name in TRIGGER_TIMES if _given(timing, name)), None)
+    if trigger:
+        times["trigger time"] = float(timing.get(trigger))
+    if _given(timing, "ActualCardiacTriggerDelayTime"):
+        times["ActualCardiacTriggerDelayTime"] = float(timing.ActualCardiacTriggerDelayTime)
+    if _given(timing, "NominalPercentageOfCardiacPhase") and rr_ms is not None:
+        share = float(timing.NominalPercentageOfCardiacPhase) / 100
+        times["NominalPercentageOfCardiacPhase"] = share * rr_ms
+    return times
+
+
+def _given(item: Any, name: str) -> bool:
+    return item.get(name) not in (None, "")
+
+
+def _rr_ms(timing: Any, dataset: Any) -> float | None:
+    for item, name in (
+        (timing, "NominalInterval"),
+        (timing, "RRIntervalTimeNominal"),
+        (timing, "HeartRate"),
+        (dataset, "CardiacRRIntervalSpecified"),
+    ):
+        if _given(item, name) and float(item.get(name)) > 0:
+            value = float(item.get(name))
+            return 60000 / value if name == "HeartRate" else value
+    return None
+
+
+def _series_name(dataset: Any) -> str:
+    number, title = dataset.get("SeriesNumber"), dataset.get("SeriesDescription")
+    name = "images of an unnumbered series" if number in (None, "") else f"series {number}"
+    return f'{name} "{title}"' if title else name
+
+
+def _kind(dataset: Any, frame_type: Any) -> str:
+    """``original`` magnitude images, or else what sort of image it is."""
+    described = frame_type.get("FrameType") or dataset.get("ImageType") or []
+    values = [str(value).upper() for value in described] if len(described) else []
+    component = frame_type.get("ComplexImageComponent") or dataset.get("ComplexImageComponent")
+    if component not in (None, "", "MAGNITUDE"):
+        return str(component).lower()
+    if PHASE_IMAGES & set(values[2:]):
+        return "phase"
+    return DERIVED if values[:1] == ["DERIVED"] else ORIGINAL

@@ -14,7 +14,8 @@ from nibabel.filebasedimages import ImageFileError
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.imaging.cine import MIN_PHASES, MIN_SLICES, Cine, Stack, common_phases
+from pipeline.imaging.cine import Cine, Stack, common_phases
+from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 

@@ -30,7 +30,7 @@ def run(job: Job) -> dict[str, Any]:
         "spacing_mm": [round(float(value), 4) for value in cine.spacing_mm],
         "rr_s": round(cine.rr_s, 4),
         "timing_source": stack.timing_source,
-        "left_out": len(stack.left_out),
+        "left_out": list(stack.left_out),
     }
 
 
@@ -40,10 +40,18 @@ def _require_ecg_as_long(job: Job, stack: Stack) -> None:
         return
     ecg = read_ecg(job.study.ecg.mr)
     lasts_s = len(ecg.signal_mv) / ecg.sampling_rate_hz
-    needed_s = float(stack.rr_ms.sum()) / 1000
+    # The slices of a volume are acquired together; nothing but a heartbeat is certain.
+    beats_ms = stack.rr_ms[:1] if _is_volume(stack) else stack.rr_ms
+    needed_s = float(beats_ms.sum()) / 1000
     if lasts_s < needed_s:
         raise InputError(
             f"{job.study.ecg.mr}: the ECG is shorter than the cine: it lasts {lasts_s:.1f} s, and "
-            f"{len(stack.rr_ms)} slices of a heartbeat each take {needed_s:.1f} s at the least; "
+            f"{len(beats_ms)} slices of a heartbeat each take {needed_s:.1f} s at the least; "
             "give the whole record, or take it out of the study"
         )
+
+
+def _is_volume(stack: Stack) -> bool:
+    """Whether slices are about as thin as their pixels, as no slices acquired one by one are."""
+    column_mm, row_mm, slice_mm = stack.cine.spacing_mm
+    return bool(slice_mm < 1.5 * max(column_mm, row_mm))

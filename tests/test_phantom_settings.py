@@ -1,0 +1,141 @@
+"""What can be asked of the phantom: by file, by flag, and how senseless wishes are refused."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import data_synth
+from data_synth import PhantomSettings, read_settings
+from data_synth.__main__ import ProgressLine, main
+from data_synth.errors import SynthError
+from data_synth.population import PATHOLOGIES
+from data_synth.settings import Pathology
+from data_synth.settings_table import settings_table
+
+
+def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
+    settings = PhantomSettings.model_validate(
+        {"ecg": {"mains_mv": 0.1}, "mr": {"field_strength_t": 3.0}}
+    )
+    assert settings.ecg.magnetohydrodynamic_mv == 0.5
+    assert settings.ecg.field_strength_t == 3.0
+    assert PhantomSettings.model_validate(settings.model_dump(mode="json")) == settings
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("mr: {phases: 1}", r"mr\.phases.*greater than or equal to 2"),
+        ("mr: {snr: 0}", r"mr\.snr.*greater than 0"),
+        ("mr: {pixel_mm: -1}", r"mr\.pixel_mm"),
+        ("mr: {slice_thickness_mm: -8}", r"mr\.slice_thickness_mm.*greater than 0"),
+        ("mr: {snr: .nan}", r"mr\.snr"),
+        ("mr: {field_strength_t: 2}", r"mr\.field_strength_t"),
+        ("ecg: {field_strength_t: 3}", r"ecg\.field_strength_t = 3.0 is not mr"),
+        ("ultrasound: {depth_mm: -1}", r"ultrasound\.depth_mm"),
+        ("ultrasound: {probe: sonic}", r"ultrasound\.probe.*transoesophageal"),
+        ("heart_rate_bpm: -70", "heart_rate_bpm"),
+        ("spread: 9", "spread"),
+        ("seed: -1", "seed"),
+        ("pathology: grief", r"pathology.*healthy.*infarct.*enlarged_atrium.*'grief'"),
+        ("cine: film", r"cine.*dicom.*enhanced.*nifti"),
+        ("colour: red", "colour: unknown key"),
+        ("mr: {flavour: 1}", r"mr\.flavour: unknown key"),
+        ("- 1", "keys and values"),
+        ("mr: [", "cannot be read as YAML"),
+    ],
+)
+def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):
+    config = tmp_path / "bad.yaml"
+    config.write_text(text)
+    with pytest.raises(SynthError, match=words):
+        read_settings(config)
+    assert main([str(tmp_path / "out"), "--config", str(config)]) == 2
+    assert str(config) in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_flags_lie_over_the_settings_of_the_file(tmp_path, monkeypatch):
+    """Each flag reaches the study that is written, and the file holds for the rest."""
+    config = tmp_path / "mine.yaml"
+    config.write_text("pathology: rv_dilation\nspread: 0.5\n")
+    made = []
+    monkeypatch.setattr("data_synth.study.write_study", lambda *given: made.append(given))
+    flags = ["--pathology", "infarct", "--cine", "enhanced", "--seed", "7", "--preview"]
+    assert main([str(tmp_path / "o"), "--config", str(config), *flags]) == 0
+    ((folder, settings, _, overwrite, preview),) = made
+    assert folder == tmp_path / "o" / "patient-0001"
+    assert (settings.pathology, settings.cine, settings.seed) == ("infarct", "enhanced", 7)
+    assert settings.spread == 0.5
+    assert preview
+    assert not overwrite
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--config", "none.yaml"], "none.yaml"),
+        (["--patients", "0"], "--patients"),
+        (["--seed", "-1"], "seed"),
+        (["--pathology", "grief"], "infarct"),
+    ],
+)
+def test_bad_flags_are_refused_and_nothing_is_written(tmp_path, capsys, flags, words):
+    assert main([str(tmp_path / "out"), *flags]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_pipelines_command_passes_its_flags_on(tmp_path):
+    command = [sys.executable, "-m", "pipeline", "synth", str(tmp_path / "o"), "--pathology", "x"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "hypertrophic_cardiomyopathy" in done.stderr
+    assert not (tmp_path / "o").exists()
+
+
+def test_settings_and_help_know_every_pathology(capsys):
+    assert get_args(Pathology) == PATHOLOGIES
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = "".join(capsys.readouterr().out.split())
+    assert all(name in told for name in PATHOLOGIES)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path("configs/phantoms").glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_shipped_phantoms_are_valid(path):
+    assert isinstance(read_settings(path), PhantomSettings)
+
+
+def test_every_public_name_can_be_had_and_importing_is_light():
+    for name in data_synth.__all__:
+        assert getattr(data_synth, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'sorcery'"):
+        _ = data_synth.sorcery
+    script = "import data_synth, sys; assert not {'numpy', 'numba'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_the_settings_table_tells_limits_choices_and_meanings():
+    rows = {line.split("`")[1]: line for line in settings_table().splitlines()[2:]}
+    assert "| 25 | ≥ 2, ≤ 100 |" in rows["mr.phases"]
+    assert "> 0" in rows["mr.snr"]
+    assert "hypertrophic_cardiomyopathy" in rows["pathology"]
+    assert "Way from end-expiration" in rows["ultrasound.breathing.amplitude_mm"]
+    assert len(rows) == len(set(rows)) > 80
+
+
+def test_progress_appears_only_for_long_work(capsys):
+    line = ProgressLine("patient-0001")
+    line(1, 2)
+    line.end()
+    assert capsys.readouterr().err == ""
+    line.next = 0.0
+    line(1, 2)
+    line.end()
+    assert capsys.readouterr().err == "\rpatient-0001:  50 %\n"
