@@ -1,28 +1,24 @@
-"""Baking and asking a field, beside peers in one run: a group's table gives the ratios."""
+"""Baking a field, beside peers in one run: a group's table gives the ratios."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista
 from pytest_benchmark.fixture import BenchmarkFixture
-from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import map_coordinates
 
 from pipeline.field import BakeSettings, ForceField
 from pipeline.field.bake import bake_field
-from pipeline.field.certificate import vtk_distance
-from pipeline.field.distance import node_axes, signed_distance
+from pipeline.field.distance import signed_distance
+from pipeline.field.exact import vtk_distance
 from pipeline.field.fixture import DEFAULT_FIXTURES
-from pipeline.geometry import Float, Grid, MovingSurface, Surface
+from pipeline.geometry import Grid, MovingSurface, Surface
 
 # VTK would need minutes for the whole grid: it gets every 64th node, so its ratio is 64 times
 # what the table says.
 VTK_SHARE = 64
-QUERY_POINTS = 100_000
 
 
 def heart_like(level: int) -> Surface:
@@ -47,12 +43,6 @@ def bake_study(folder: Path, phase_count: int) -> ForceField:
     }
     bake_field(folder, surfaces, DEFAULT_FIXTURES, BakeSettings(), rr_s=0.8)
     return ForceField.open(folder)
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory: pytest.TempPathFactory) -> ForceField:
-    """Three phases of the study."""
-    return bake_study(tmp_path_factory.mktemp("bench") / "field.zarr", 3)
 
 
 # 5k triangles: the tree is small; 20k: a heart of 2 mm edges; 80k: one of 1 mm.
@@ -80,42 +70,3 @@ def test_bake(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
     field = benchmark.pedantic(bake_study, args=(tmp_path / "field.zarr", 25), rounds=1)
     assert field.accuracy["sign_errors"] == 0
     benchmark.extra_info |= {"accuracy": field.accuracy, "grid": field.grid.shape}
-
-
-def questions(field: ForceField) -> dict[str, Callable[[], Float]]:
-    """Ours in 4D; SciPy's answers are one phase's distance only, without gradient."""
-    grid, rng = field.grid, np.random.default_rng(0)
-    inner = np.array(grid.spacing_mm)
-    points: Float = rng.uniform(grid.origin_mm + inner, grid.upper_mm - inner, (QUERY_POINTS, 3))
-    volume = field.stored_distance_mm("epicardium", 1)
-    linear = RegularGridInterpolator(node_axes(grid)[::-1], volume)
-    places = ((points - grid.origin_mm) / grid.spacing_mm).T[::-1]
-    return {
-        "force, ours": lambda: field.force_n(points, 0.13),
-        "distance and gradient, ours": lambda: field.gradient(points, 0.13),
-        "distance, map_coordinates": lambda: map_coordinates(
-            volume, places, order=3, prefilter=False
-        ),
-        "distance, RegularGridInterpolator": lambda: linear(points[:, ::-1]),
-    }
-
-
-@pytest.mark.parametrize(
-    "who",
-    [
-        "force, ours",
-        "distance and gradient, ours",
-        "distance, map_coordinates",
-        "distance, RegularGridInterpolator",
-    ],
-)
-def test_batch(benchmark: BenchmarkFixture, field: ForceField, who: str) -> None:
-    """100,000 random points."""
-    benchmark.group = f"{QUERY_POINTS} random points"
-    assert np.isfinite(benchmark(questions(field)[who])).all()
-
-
-def test_single_point(benchmark: BenchmarkFixture, field: ForceField) -> None:
-    """What a loop in Python pays for one force."""
-    benchmark.group = "one point a call"
-    assert np.isfinite(benchmark(field.force_n, np.array([[10.0, 20.0, 30.0]]), 0.13)).all()

@@ -272,17 +272,46 @@ def _ask(
 
 
 @app.command
-def verify(field: Path, /) -> int:
+def verify(field: Path, /, *, surfaces: Path | None = None) -> int:
     """Check a baked field: manifest, sizes, checksums, metadata, finite values.
 
     Parameters
     ----------
     field
         The field.zarr folder.
+    surfaces
+        Folder of the surfaces it was baked from: its accuracy is measured anew against them.
     """
     from pipeline.field.store import verify_field
 
     print(f"{field}: {verify_field(field)}")
+    if surfaces is not None:
+        from pipeline.own_surfaces import measure_field
+
+        measured = measure_field(field, surfaces, Console().progress)
+        for name, value in measured.items():
+            if name not in {"structures", "fixtures"} and value is not None:
+                print(f"{name:36} {value:.6g}")
+    return 0
+
+
+@app.command
+def export(field: Path, /, *, to: str, out: Path) -> int:
+    """Write a baked field's distances and potentials for other programs.
+
+    Parameters
+    ----------
+    field
+        The field.zarr folder.
+    to
+        nrrd (3D Slicer sequences), nifti, vti (ParaView), mhd (headers that point into the field,
+        without a copy) or sofa (raw distance grids).
+    out
+        Folder to write; must not exist.
+    """
+    from pipeline.field.export import export_field
+
+    print(f"exported  {export_field(field, to, out)}")
     return 0
 
 
@@ -290,7 +319,7 @@ def verify(field: Path, /) -> int:
 def synth(
     *arguments: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)],
 ) -> int:
-    """Make synthetic patient studies: beatfield synth OUT [--seed N] [--patients N] ...
+    """Make synthetic patient studies: beatfield synth OUT [--seed N] [--preview] ...
 
     `beatfield synth --help` lists all options.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Collection
@@ -16,8 +17,10 @@ from pipeline import __version__
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.field.bake import SurfaceSeries, bake_field
+from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
-from pipeline.field.fixture import Fixture
+from pipeline.field.fixture import BakeSettings, Bounds, Fixture
+from pipeline.field.reader import ForceField
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
 from pipeline.study import describe_validation
@@ -89,6 +92,52 @@ def bake_own_surfaces(
     return field
 
 
+def measure_field(
+    path: Path, folder: Path, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Any]:
+    """Measure a baked field anew against the surfaces in a folder.
+
+    Parameters
+    ----------
+    path
+        The ``field.zarr`` folder.
+    folder
+        Holds the surfaces that it was baked from, as ``read_own_surfaces`` reads them; others
+        beside them are left alone.
+    progress
+        Called with (done, total) while phases are measured.
+
+    Returns
+    -------
+    A certificate like the one that the field carries.
+
+    Raises
+    ------
+    InputError
+        When the field cannot be opened, or a surface is missing or has other phases.
+    StageError
+        When the field is out of the default bounds.
+    """
+    field = ForceField.open(path)
+    own = read_own_surfaces(folder, field.structures)
+    counts = {name: len(series.phases) for name, series in own.surfaces.items()}
+    count = len(field.phases)
+    if any(number != count for number in counts.values()):
+        raise InputError(f"{folder}: surfaces of {counts} phases, {path} has {count}")
+    surfaces = {
+        name: SurfaceSeries(series.surfaces, field.phases) for name, series in own.surfaces.items()
+    }
+    done = itertools.count(1)
+    accuracy = certify(
+        field,
+        surfaces,
+        BakeSettings().samples,
+        lambda: progress(next(done), count) if progress else None,
+    )
+    require_bounds(accuracy, Bounds(), min(field.grid.spacing_mm))
+    return accuracy
+
+
 def _fixtures_for(surfaces: Collection[str], settings: Settings) -> dict[str, Fixture]:
     """The fixtures that a configuration asks for.
 
@@ -106,11 +155,12 @@ def _fixtures_for(surfaces: Collection[str], settings: Settings) -> dict[str, Fi
     }
 
 
-def read_own_surfaces(folder: Path) -> OwnSurfaces:
+def read_own_surfaces(folder: Path, only: Collection[str] | None = None) -> OwnSurfaces:
     """Read ``<structure>_000.vtp``, ``<structure>_001.vtp`` ... or ``<structure>/000.vtp`` ...
 
     One file a phase, VTP, STL or PLY, in LPS mm, closed, normals outwards. A structure with a
-    single file, numbered or not, does not move. Triangles may differ between phases.
+    single file, numbered or not, does not move. Triangles may differ between phases. With
+    ``only``, those structures are read, and all of them must be there.
 
     Raises
     ------
@@ -119,6 +169,11 @@ def read_own_surfaces(folder: Path) -> OwnSurfaces:
         read, is open, or faces inwards. Nothing is repaired.
     """
     files = _files_by_structure(folder)
+    if only is not None:
+        missing = sorted(set(only) - set(files))
+        if missing:
+            raise InputError(f"{folder}: has no {', '.join(missing)}; it has {', '.join(files)}")
+        files = {name: files[name] for name in only}
     counts = {name: len(paths) for name, paths in files.items()}
     phase_count = max(counts.values())
     odd = [f"{name} has {n}" for name, n in counts.items() if n not in (1, phase_count)]

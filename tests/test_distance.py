@@ -16,12 +16,13 @@ from field_shapes import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.field.certificate import vtk_distance
 from pipeline.field.distance import signed_distance
-from pipeline.geometry import Float, Grid, Surface
+from pipeline.field.exact import vtk_distance
+from pipeline.geometry import Float, Grid, Integer, Surface
 
 EPSILON = float(np.finfo(np.float32).eps)
 
@@ -208,12 +209,118 @@ def test_moving_surface_and_points_together_changes_nothing(seed, turn, shift):
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
 
-def test_threads_and_repeats_give_the_same_bytes():
-    surface, grid = lumpy(5), cube_grid(35, 20)
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_threads_and_repeats_give_the_same_bytes(threads):
+    surface, grid = lumpy(5), cube_grid(35, 40)
 
     alone = signed_distance(surface, grid, threads=1)
 
-    assert signed_distance(surface, grid, threads=3).tobytes() == alone.tobytes()
+    assert signed_distance(surface, grid, threads=threads).tobytes() == alone.tobytes()
+
+
+def some_nodes(grid: Grid, count: int, seed: int = 0) -> Integer:
+    """Numbers of nodes drawn at random: exact libraries are too slow for all of them."""
+    return np.random.default_rng(seed).choice(int(np.prod(grid.shape)), count, replace=False)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.4, 1.1, 2.7), (3.1, 0.7, 0.3)])
+def test_many_small_triangles_agree_with_vtk(spacing):
+    """More nodes than one block has, and boxes of triangles on several levels."""
+    shape = tuple(int(np.ceil(52 / step)) for step in spacing[::-1])
+    surface = lumpy(11, level=5, radius=15.0)
+    grid = Grid(shape, (-26.0, -25.5, -25.2), spacing)
+    some = some_nodes(grid, 1500)
+    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)[some])
+
+    found = signed_distance(surface, grid).ravel()[some]
+
+    np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
+
+
+def test_wall_of_half_a_millimetre_keeps_its_sign_and_distance():
+    """Each skin alone is asked of VTK; a node in the wall is within one and outside the other."""
+    outer, inner = sphere(20.0, 4), sphere(19.5, 4)
+    wall = joined(outer, Surface(inner.vertices_mm, inner.triangles[:, ::-1]))
+    grid = cube_grid(23, 41)
+    points = grid.nodes_mm().reshape(-1, 3)
+    radius = np.linalg.norm(points, axis=1)
+    # All nodes about the wall, and some of the others.
+    some = np.union1d(np.flatnonzero(np.abs(radius - 19.75) < 0.5), some_nodes(grid, 1000))
+    exact = np.maximum(vtk_distance(outer, points[some]), -vtk_distance(inner, points[some]))
+
+    found = signed_distance(wall, grid).ravel()[some]
+
+    np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(radius))
+    assert (exact < 0).sum() > 100
+    assert (np.signbit(found) == (exact < 0)).all()
+
+
+def test_nodes_as_far_from_everything_find_the_nearest():
+    """About the middle of a ball all 20,480 triangles are within a hair of the nearest."""
+    surface, grid = sphere(25.0, 5), Grid((6, 7, 8), (-0.03, -0.02, -0.05), (0.01, 0.01, 0.01))
+    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
+
+    found = signed_distance(surface, grid)
+
+    np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
+
+
+def test_surface_wholly_outside_the_grid():
+    surface, grid = lumpy(2), Grid((9, 8, 7), (200.0, -350.0, 90.0), (1.0, 2.0, 0.5))
+    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
+
+    found = signed_distance(surface, grid)
+
+    np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
+
+
+@pytest.mark.parametrize("sliver", [1e-3, 1e-7, 1e-12, 1e-15])
+def test_slivers_are_exact(sliver):
+    """A face of a box is cut into needles by a corner that all but lies on its edge."""
+    low, high = (-6, -5, -4), (6, 5, 4)
+    whole = box(low, high)
+    near = 0.4 * whole.vertices_mm[0] + 0.6 * whole.vertices_mm[1] + (0, sliver, 0)
+    kept = [list(t) for t in BOX_TRIANGLES if list(t) != [0, 2, 1]]
+    surface = Surface(
+        np.vstack([whole.vertices_mm, near]), np.array([*kept, [0, 2, 8], [8, 2, 1], [0, 8, 1]])
+    )
+    grid = cube_grid(9, 25)
+
+    found = signed_distance(surface, grid)
+
+    # Half a unit in the last place of the coordinates is all that may change.
+    np.testing.assert_allclose(found, signed_distance(whole, grid), rtol=EPSILON, atol=1e-14)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    corners=st.integers(4, 24),
+    sizes=st.tuples(*[st.floats(0.02, 20)] * 3),
+    spacing=st.tuples(*[st.floats(0.3, 5)] * 3),
+)
+def test_random_polyhedra_agree_with_brute_force(seed, corners, sizes, spacing):
+    """Two convex bodies, which may overlap, be flat, or be far larger than the grid."""
+    rng = np.random.default_rng(seed)
+    surface = joined(*(hull(rng.normal(size=(corners, 3)) * sizes) for _ in range(2)))
+    grid = Grid((6, 7, 8), tuple(-3.3 * np.array(spacing)), spacing)
+    points = grid.nodes_mm().reshape(-1, 3)
+    exact, winding = brute_distance(points, surface), winding_number(points, surface)
+
+    found = signed_distance(surface, grid).ravel()
+
+    np.testing.assert_allclose(np.abs(found), exact, rtol=EPSILON, atol=1e-12)
+    # Solid angles are no good on the surface itself.
+    clear = exact > 1e-6
+    assert ((found < 0) == (winding > 0.5))[clear].all()
+
+
+def hull(points: Float) -> Surface:
+    """The convex hull, facing outwards."""
+    triangles = ConvexHull(points).simplices.astype(np.int64)
+    corners = points[triangles] - points.mean(axis=0)
+    outward = np.einsum("ij,ij->i", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]) > 0
+    return Surface(points, np.where(outward[:, None], triangles, triangles[:, ::-1]))
 
 
 def test_surface_may_reach_beyond_the_grid():

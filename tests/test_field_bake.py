@@ -10,6 +10,7 @@ import pyvista
 from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, bake_small, ball_and_core
 from field_shapes import beating, box, lumpy, sag, sphere
 
+from pipeline.cli import main
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.field import BakeSettings, Fixture, ForceField
@@ -19,7 +20,7 @@ from pipeline.field.fixture import Bounds
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.store import verify_field
 from pipeline.geometry import MovingSurface
-from pipeline.own_surfaces import bake_own_surfaces
+from pipeline.own_surfaces import bake_own_surfaces, measure_field
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
 
@@ -283,6 +284,25 @@ def test_surfaces_of_ones_own(folder, tmp_path):
     }
     verify_field(tmp_path / "out" / "field.zarr")
     assert {one.name for one in (tmp_path / "out").iterdir()} == {".lock", "field.zarr"}
+
+
+def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
+    """The same figures as at baking; surfaces of another field are refused."""
+    baked = bake_own_surfaces(folder, tmp_path / "out", own_settings())
+    said = ForceField.open(baked).accuracy
+
+    measured = measure_field(baked, folder)
+
+    # More samples than at baking, so larger errors may be found, of the same order.
+    assert measured["sign_errors"] == 0
+    assert said["surface_error_p99_mm"] / 2 < measured["surface_error_p99_mm"] < 1.0
+    assert main(["verify", str(baked), "--surfaces", str(folder)]) == 0
+    assert "surface_error_p99_mm" in capsys.readouterr().out
+    (folder / "box_002.ply").unlink()
+    with pytest.raises(InputError, match="has 3"):
+        measure_field(baked, folder)
+    with pytest.raises(InputError, match="has no box"):
+        measure_field(baked, folder / "ball")
 
 
 def test_timing_and_tracker_of_ones_own(folder, tmp_path):

@@ -14,9 +14,9 @@ import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.field.exact import ExactSurface, points_about
-from pipeline.field.exact import vtk_distance as vtk_distance
 from pipeline.field.fixture import DEVICES, Bounds
-from pipeline.field.reader import ForceField, processors
+from pipeline.field.reader import ForceField
+from pipeline.field.threads import processors
 from pipeline.geometry import Float, Surface
 
 BAND_MM = 15.0
@@ -191,7 +191,7 @@ def _drift_mm(volume: ForceField, structure: str, moving: BeatingSurface) -> flo
 
     phases = volume.phases
     each = [moving.at(index) for index in range(len(phases))]
-    same = all(one.triangles is each[0].triangles for one in each)
+    same = all(np.array_equal(one.triangles, each[0].triangles) for one in each)
     if not same or len(phases) < 3:
         return None
     chosen = np.random.default_rng(0).integers(len(each[0].vertices_mm), size=500)

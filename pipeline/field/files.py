@@ -38,6 +38,13 @@ def map_phase(array: Path, index: int, grid: Grid) -> Float32:
     return np.asarray(np.memmap(path, dtype="<f4", mode="r", shape=grid.shape))
 
 
+def readable_in_fours(coefficients: Float32) -> Float32:
+    """The same array, or on a grid narrower than the kernels read at a time a longer copy."""
+    if coefficients.shape[2] >= 4:
+        return coefficients
+    return np.pad(coefficients.ravel(), (0, 3))
+
+
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size

@@ -6,11 +6,14 @@ interpreter lock, so callers split work over threads.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
 from pipeline.field import potential as formulas
@@ -25,110 +28,164 @@ _direction_scale = formulas.direction_scale
 CONTRACT = {"contract"}
 """A product and a sum may be rounded once instead of twice; nothing else is relaxed."""
 
+ASKED: dict[str, Any] = {
+    "nogil": True, "cache": True, "fastmath": CONTRACT, "no_cfunc_wrapper": True,
+}  # fmt: skip
+# No way in from Python, which would be compiled too.
+_INNER = {**ASKED, "no_cpython_wrapper": True}
+
+
+_FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)
+_FOUR = ir.VectorType(ir.DoubleType(), 4)
+
+
+def _place_of(n: int) -> Any:
+    return ir.Constant(ir.IntType(32), n)
+
+
+def _spread(builder: Any, number: Any) -> Any:
+    """A number four times."""
+    four = ir.Constant(_FOUR, ir.Undefined)
+    for n in range(4):
+        four = builder.insert_element(four, number, _place_of(n))
+    return four
+
+
+def _nodes(builder: Any, address: Any, row: Any) -> Any:
+    """Four float32 numbers from number ``row`` after an address on, as float64."""
+    start = builder.add(address, builder.shl(row, ir.Constant(row.type, 2)))
+    singles = builder.load(builder.inttoptr(start, _FOUR_SINGLE.as_pointer()), align=4)
+    return builder.fpext(singles, _FOUR)
+
+
+def _mixed(builder: Any, weights: Any, parts: Any) -> Any:
+    """Weighted sum; products and sums are fused where the processor can."""
+    fused = tuple(CONTRACT)
+    products = [builder.fmul(a, b, flags=fused) for a, b in zip(weights, parts, strict=True)]
+    return functools.reduce(lambda a, b: builder.fadd(a, b, flags=fused), products)
+
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba has no types
-def _value(typing_context: Any, address: Any, index: Any) -> Any:
-    """The float32 number ``index`` after an address, as float64."""
+def _sum(typing_context: Any, phases: Any, rows: Any, weights: Any) -> Any:
+    """Value, and slopes per step of the grid, from nine rows of four nodes at three phases.
+
+    Whole rows are summed as vectors, and along x last: a loop over single nodes takes twice as
+    long to answer, and several times as long to compile.
+
+    Parameters
+    ----------
+    phases
+        Three addresses of float32 ``(z, y, x)`` coefficients.
+    rows
+        Number of the first node of each row, those with the same z together.
+    weights
+        23 numbers: of three phases, of nodes along x (4), y (3) and z (3), and their slopes.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        single = context.get_value_type(types.float32)
-        start = builder.inttoptr(arguments[0], single.as_pointer())
-        value = builder.load(builder.gep(start, [arguments[1]]))
-        return builder.fpext(value, context.get_value_type(types.float64))
+        p, starts, w = (cgutils.unpack_tuple(builder, argument) for argument in arguments)
+        mixed = functools.partial(_mixed, builder)
+        wx, sx = w[3:7], w[13:17]
+        time, wy, wz, sy, sz = (
+            [_spread(builder, one) for one in part]
+            for part in (w[:3], w[7:10], w[10:13], w[17:20], w[20:])
+        )
+        planes, slopes = [], []
+        for c in range(0, 9, 3):
+            lines = [
+                mixed(time, [_nodes(builder, one, start) for one in p])
+                for start in starts[c : c + 3]
+            ]
+            planes.append(mixed(wy, lines))
+            slopes.append(mixed(sy, lines))
+        value, along_y, along_z = mixed(wz, planes), mixed(wz, slopes), mixed(sz, planes)
+        found = [
+            mixed(along, [builder.extract_element(row, _place_of(n)) for n in range(4)])
+            for along, row in ((wx, value), (sx, value), (wx, along_y), (wx, along_z))
+        ]
+        return context.make_tuple(builder, signature.return_type, found)
 
-    return types.float64(types.uintp, types.intp), generate
+    return types.UniTuple(types.float64, 4)(phases, rows, weights), generate
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
+@njit(**_INNER)
 def _three(place, count):  # type: ignore[no-untyped-def]
     """Three neighbours of a place on one axis, their weights, and their slopes per step.
 
     Beyond the grid's end the coefficients go on in a straight line; the ghost is folded into
-    the weights of the two last, so every index stays inside the grid.
+    the weights of the two last, so every index that has a weight stays inside the grid.
     """
     place = min(max(place, 0.0), count - 1.0)
     middle = int(place + 0.5)
     t = place - middle
     w0, w1, w2 = 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
     s0, s1, s2 = t - 0.5, -2.0 * t, t + 0.5
-    i0, i2 = middle - 1, middle + 1
-    if i0 < 0:
+    if middle == 0:
         w1, w2, w0, s1, s2, s0 = w1 + 2 * w0, w2 - w0, 0.0, s1 + 2 * s0, s2 - s0, 0.0
-        i0 = 0
-    if i2 >= count:
+    if middle == count - 1:
         w1, w0, w2, s1, s0, s2 = w1 + 2 * w2, w0 - w2, 0.0, s1 + 2 * s2, s0 - s2, 0.0
-        i2 = middle
-    return i0, middle, i2, w0, w1, w2, s0, s1, s2
+    return middle, (w0, w1, w2), (s0, s1, s2)
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
+def _four(weights, left):  # type: ignore[no-untyped-def]
+    """Weights of three neighbours as those of four nodes, the first of them at ``left``."""
+    w0, w1, w2 = weights
+    if left == 0:
+        return w0, w1, w2, 0.0
+    if left == 1:
+        return 0.0, w0, w1, w2
+    # At the ends, where one neighbour is a ghost without weight.
+    return (w1, w2, 0.0, 0.0) if left < 0 else (0.0, 0.0, w0, w1)
+
+
+@njit(**_INNER)
 def _moment(line, phase):  # type: ignore[no-untyped-def]
     """Interval of a phase in ``spline.timeline``, and the weights of its three phases."""
-    first = line[0, 0]
-    turned = phase - math.floor(phase - first)
-    if turned >= first + 1.0:
-        turned -= 1.0
-    low, high = 0, len(line)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if line[middle, 0] <= turned:
-            low = middle
-        else:
-            high = middle
+    first, count = line[0, 0], len(line)
+    turned = phase
+    if not first <= turned < first + 1.0:
+        turned -= math.floor(phase - first)
+        if turned >= first + 1.0:
+            turned -= 1.0
+    # Phases are mostly evenly spaced; where they are not, halving finds the interval.
+    low = int((turned - first) * count)
+    if low < 0 or low >= count or line[low, 0] > turned or line[low, 1] <= turned:
+        low, high = 0, count
+        while high - low > 1:
+            middle = (low + high) // 2
+            if line[middle, 0] <= turned:
+                low = middle
+            else:
+                high = middle
     late, early = turned - line[low, 0], line[low, 1] - turned
     before, after = early * early * line[low, 2], late * late * line[low, 3]
-    return low, before, 1.0 - before - after, after
+    return low, (before, 1.0 - before - after, after)
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
-def _row(p0, p1, p2, t0, t1, t2, start, i0, i1, i2, w0, w1, w2, s0, s1, s2):  # type: ignore[no-untyped-def]
-    """One row of nodes along x at one moment: its value, and its slope along x."""
-    a = t0 * _value(p0, start + i0) + t1 * _value(p1, start + i0) + t2 * _value(p2, start + i0)
-    b = t0 * _value(p0, start + i1) + t1 * _value(p1, start + i1) + t2 * _value(p2, start + i1)
-    c = t0 * _value(p0, start + i2) + t1 * _value(p1, start + i2) + t2 * _value(p2, start + i2)
-    return w0 * a + w1 * b + w2 * c, s0 * a + s1 * b + s2 * c
-
-
-@njit(nogil=True, cache=True, fastmath=CONTRACT, inline="always")
-def _plane(p0, p1, p2, t0, t1, t2, start, width, xs, ys):  # type: ignore[no-untyped-def]
-    """One plane of nine nodes: value, and slopes along x and y."""
-    i0, i1, i2, w0, w1, w2, s0, s1, s2 = xs
-    j0, j1, j2, u0, u1, u2, r0, r1, r2 = ys
-    a, ax = _row(p0, p1, p2, t0, t1, t2, start + j0 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
-    b, bx = _row(p0, p1, p2, t0, t1, t2, start + j1 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
-    c, cx = _row(p0, p1, p2, t0, t1, t2, start + j2 * width, i0, i1, i2, w0, w1, w2, s0, s1, s2)
-    return (
-        u0 * a + u1 * b + u2 * c,
-        u0 * ax + u1 * bx + u2 * cx,
-        r0 * a + r1 * b + r2 * c,
-    )
-
-
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Distance and gradient at one point; see ``sample``."""
-    count_x, count_y, count_z = int(grid[6]), int(grid[7]), int(grid[8])
-    k, t0, t1, t2 = _moment(line, phase)
-    phases = len(addresses)
-    p0 = addresses[k - 1 if k > 0 else phases - 1]
-    p1 = addresses[k]
-    p2 = addresses[k + 1 if k + 1 < phases else 0]
-    xs = _three((x_mm - grid[0]) / grid[3], count_x)
-    ys = _three((y_mm - grid[1]) / grid[4], count_y)
-    k0, k1, k2, v0, v1, v2, q0, q1, q2 = _three((z_mm - grid[2]) / grid[5], count_z)
-    layer = count_x * count_y
-    a, ax, ay = _plane(p0, p1, p2, t0, t1, t2, k0 * layer, count_x, xs, ys)
-    b, bx, by = _plane(p0, p1, p2, t0, t1, t2, k1 * layer, count_x, xs, ys)
-    c, cx, cy = _plane(p0, p1, p2, t0, t1, t2, k2 * layer, count_x, xs, ys)
-    return (
-        v0 * a + v1 * b + v2 * c,
-        (v0 * ax + v1 * bx + v2 * cx) / grid[3],
-        (v0 * ay + v1 * by + v2 * cy) / grid[4],
-        (q0 * a + q1 * b + q2 * c) / grid[5],
-    )
+    width, height, depth = int(grid[6]), int(grid[7]), int(grid[8])
+    k, time = _moment(line, phase)
+    last = len(addresses) - 1
+    p0, p2 = addresses[k - 1 if k > 0 else last], addresses[k + 1 if k < last else 0]
+    i, wx, sx = _three((x_mm - grid[0]) * grid[9], width)
+    j, wy, sy = _three((y_mm - grid[1]) * grid[10], height)
+    n, wz, sz = _three((z_mm - grid[2]) * grid[11], depth)
+    first = max(min(i - 1, width - 4), 0)
+    wx, sx = _four(wx, i - 1 - first), _four(sx, i - 1 - first)
+    # Neighbours without weight may lie outside: any node inside does in their place.
+    j0, j1, j2 = max(j - 1, 0) * width, j * width, min(j + 1, height - 1) * width
+    layer = width * height
+    k0, k1, k2 = max(n - 1, 0) * layer, n * layer, min(n + 1, depth - 1) * layer
+    k0, k1, k2 = k0 + first, k1 + first, k2 + first
+    rows = (k0 + j0, k0 + j1, k0 + j2, k1 + j0, k1 + j1, k1 + j2, k2 + j0, k2 + j1, k2 + j2)
+    value, gx, gy, gz = _sum((p0, addresses[k], p2), rows, time + wx + wy + wz + sx + sy + sz)
+    return value, gx * grid[9], gy * grid[10], gz * grid[11]
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**ASKED)
 def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Distance and gradient at one point: four numbers, none where the question has none.
 
@@ -139,7 +196,7 @@ def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore
     return _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     distance_mm, gx, gy, gz = _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
     size = _pull(distance_mm, side, delta_mm, m)
@@ -147,7 +204,7 @@ def _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, 
     return scale * gx, scale * gy, scale * gz
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**ASKED)
 def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Force at one point: three newtons, none where the question has a number that is none."""
     if not math.isfinite(x_mm + y_mm + z_mm + phase):
@@ -155,18 +212,19 @@ def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm
     return _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase)
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**ASKED)
 def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # type: ignore[no-untyped-def]
     """Distance and its gradient at points.
 
     Parameters
     ----------
     addresses
-        ``(phase,)`` where in memory the float32 ``(z, y, x)`` coefficients of each phase are.
+        ``(phase,)`` where in memory the float32 ``(z, y, x)`` coefficients of each phase are;
+        where there are fewer than four along x, three numbers more must be readable behind them.
     line
         ``spline.timeline`` of the phases.
     grid
-        Origin, spacing and node counts, each ``x, y, z``: nine numbers.
+        Origin, spacing, node counts and nodes a millimetre, each ``x, y, z``: twelve numbers.
     points_mm
         ``(n, 3)``; those outside the grid are moved to its boundary.
     phases
@@ -183,7 +241,7 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**ASKED)
 def sample_force(addresses, line, grid, side, delta_mm, m, f_max_n, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
     """Force at points into ``(n, 3)``; the arguments are those of ``sample`` and ``force_at``."""
     for n in range(len(points_mm)):
@@ -199,7 +257,7 @@ HALVINGS = 12
 """A stretch of a tool is halved no more often than this."""
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
     """Point of a tool at a length along it, into ``feel[:3]``.
 
@@ -223,7 +281,7 @@ def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
         feel[axis] = line_mm[piece, axis] + share * (line_mm[end, axis] - line_mm[piece, axis])
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
     x = line_mm[piece + 1, 0] - line_mm[piece, 0]
     y = line_mm[piece + 1, 1] - line_mm[piece, 1]
@@ -231,7 +289,7 @@ def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-untyped-def]
     """Ask at a length along a tool: its point, the force and the distance into ``feel``."""
     addresses, line, grid, side, delta_mm, m, f_max_n = law
@@ -245,7 +303,7 @@ def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-unty
     feel[3], feel[4], feel[5], feel[6] = scale * gx, scale * gy, scale * gz, distance_mm
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**_INNER)
 def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
     """Add a share of a felt force, and of its torque about the handle."""
     ax, ay, az = feel[0] - handle_mm[0], feel[1] - handle_mm[1], feel[2] - handle_mm[2]
@@ -259,7 +317,7 @@ def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
     found[5] += weight * (x * feel[4] - y * feel[3])
 
 
-@njit(nogil=True, cache=True, fastmath=CONTRACT)
+@njit(**ASKED)
 def tool_force(law, line_mm, handle_mm, pose, phase, bound_n, found):  # type: ignore[no-untyped-def]
     """Force and torque on a line of straight pieces: the mean over its length, within a bound.
 
@@ -310,8 +368,8 @@ def tool_force(law, line_mm, handle_mm, pose, phase, bound_n, found):  # type: i
         )  # fmt: skip
         top = 0
         while top >= 0:
-            middle, length, share, depth = places[top]
-            here = stack[top]
+            middle, length, share = places[top, 0], places[top, 1], places[top, 2]
+            depth, here = places[top, 3], stack[top]
             way = 0.5 * length
             farthest = abs(here[6]) + way if side == 0 else here[6] + side * way
             if 2.0 * f_max_n * abs(_pull(farthest, side, delta_mm, m)) <= bound_n:
@@ -331,7 +389,9 @@ def tool_force(law, line_mm, handle_mm, pose, phase, bound_n, found):  # type: i
                 _add(found, here, -share / 3, pose, handle_mm)
                 top -= 1
                 continue
-            stack[top], stack[top + 1] = right, left
+            # Whole rows at once would take a second longer to compile.
+            for n in range(7):
+                stack[top, n], stack[top + 1, n] = right[n], left[n]
             places[top, 0], places[top, 1] = middle + way / 2, way
             places[top, 2], places[top, 3] = share / 2, depth + 1
             places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way

@@ -6,7 +6,6 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -18,11 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InputError
-from pipeline.field.files import map_phase, read_metadata, require_manifest
+from pipeline.field.files import map_phase, read_metadata, readable_in_fours, require_manifest
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
 from pipeline.field.spline import timeline
+from pipeline.field.threads import processors
 from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
 
 if TYPE_CHECKING:
@@ -74,11 +74,17 @@ class ForceField:
         grid = metadata.grid
         self._grid = Grid(grid.shape_zyx, grid.origin_mm, grid.spacing_mm)
         self._phases = np.array(metadata.phases)
-        self._numbers = np.array([*grid.origin_mm, *grid.spacing_mm, *grid.shape_zyx[::-1]])
+        per_mm = 1 / np.array(grid.spacing_mm)
+        self._numbers = np.array(
+            [*grid.origin_mm, *grid.spacing_mm, *grid.shape_zyx[::-1], *per_mm]
+        )
         self._line = timeline(self._phases)
         parts = metadata.structures
         self._distances = {name: self._map(part.path) for name, part in parts.items()}
-        self._coefficients = {name: self._map(part.spline) for name, part in parts.items()}
+        self._coefficients = {
+            name: [readable_in_fours(phase) for phase in self._map(part.spline)]
+            for name, part in parts.items()
+        }
         self._addresses = {
             name: np.array([phase.ctypes.data for phase in mapped], dtype=np.uintp)
             for name, mapped in self._coefficients.items()
@@ -370,11 +376,6 @@ def _in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) ->
     edges = np.linspace(0, count, workers + 1).astype(int).tolist()
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(part, edges[:-1], edges[1:]))
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
 
 
 def _not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:

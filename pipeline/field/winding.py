@@ -11,12 +11,14 @@ feature of the surface is nearest, which is what makes thin walls and touching s
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numba import njit
 
 from pipeline.errors import StageError
-from pipeline.geometry import Float, Grid, Integer, Mask
+from pipeline.geometry import Float, Float32, Integer
 
 # Rounding can lose a crossing only for a ray within about 1e-13 mm of an edge; a row whose
 # crossings do not cancel is asked again from beside.
@@ -24,28 +26,37 @@ ATTEMPTS = 4
 STEP_ASIDE_MM = 1e-7
 
 
-def inside_nodes(vertices_mm: Float, triangles: Integer, grid: Grid) -> Mask:
-    """Nodes ``(z, y, x)`` with a winding number above zero, for a closed outward surface.
+def negate_inside(
+    distance_mm: Float32,
+    vertices_mm: Float,
+    triangles: Integer,
+    axes_mm: tuple[Float, Float, Float],
+    threads: int,
+) -> None:
+    """Negate the distances ``(z, y, x)`` of nodes with a winding number above zero.
+
+    The surface must be closed and face outwards; ``axes_mm`` are the coordinates of the nodes
+    along x, y and z. Every thread works on layers of its own.
 
     Raises
     ------
     StageError
         When the crossings of a row do not cancel, which closed surfaces do not allow.
     """
-    axes = [
-        grid.origin_mm[axis] + grid.spacing_mm[axis] * np.arange(grid.shape[2 - axis])
-        for axis in range(3)
-    ]
-    for attempt in range(ATTEMPTS):
-        aside_mm = attempt * STEP_ASIDE_MM
-        winding = np.zeros((grid.shape[0], grid.shape[1], grid.shape[2] + 1), dtype=np.int16)
-        _count_crossings(
-            vertices_mm, triangles, axes[0], axes[1] + aside_mm, axes[2] + aside_mm / 3, winding
-        )
-        np.cumsum(winding, axis=2, out=winding)
-        if not winding[:, :, -1].any():
-            inside: Mask = winding[:, :, :-1] > 0
-            return inside
+    x_mm, y_mm, z_mm = axes_mm
+    winding = np.empty((len(z_mm), len(y_mm), len(x_mm) + 1), dtype=np.int16)
+    cuts = np.linspace(0, len(z_mm), threads + 1).astype(int)
+
+    def count(first: int, end: int) -> bool:
+        rows = x_mm, y_mm + aside_mm, z_mm + aside_mm / 3
+        return bool(_count_crossings(vertices_mm, triangles, *rows, first, end, winding))
+
+    with ThreadPoolExecutor(threads) as pool:
+        for attempt in range(ATTEMPTS):
+            aside_mm = attempt * STEP_ASIDE_MM
+            if all(list(pool.map(count, cuts[:-1], cuts[1:]))):
+                list(pool.map(partial(_negate, winding, distance_mm), cuts[:-1], cuts[1:]))
+                return
     raise StageError(
         "the rays through the surface enter and leave it unequally often; it is not closed"
     )
@@ -95,14 +106,19 @@ def _crossing(vertices, a, b, c, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _count_crossings(vertices, triangles, x_mm, y_mm, z_mm, winding):  # type: ignore[no-untyped-def]
+def _count_crossings(vertices, triangles, x_mm, y_mm, z_mm, first, end, winding):  # type: ignore[no-untyped-def]
+    """Count the crossings of the rows in layers ``first`` to ``end``; whether all cancel."""
     step_x, step_y, step_z = x_mm[1] - x_mm[0], y_mm[1] - y_mm[0], z_mm[1] - z_mm[0]
+    winding[first:end] = 0
     for number in range(len(triangles)):
-        a, b, c = triangles[number]
-        ya, yb, yc = vertices[a, 1], vertices[b, 1], vertices[c, 1]
+        a, b, c = triangles[number, 0], triangles[number, 1], triangles[number, 2]
         za, zb, zc = vertices[a, 2], vertices[b, 2], vertices[c, 2]
-        first_j, end_j = _node_range(min(ya, yb, yc), max(ya, yb, yc), y_mm[0], step_y, len(y_mm))
         first_k, end_k = _node_range(min(za, zb, zc), max(za, zb, zc), z_mm[0], step_z, len(z_mm))
+        first_k, end_k = max(first_k, first), min(end_k, end)
+        if first_k >= end_k:
+            continue
+        ya, yb, yc = vertices[a, 1], vertices[b, 1], vertices[c, 1]
+        first_j, end_j = _node_range(min(ya, yb, yc), max(ya, yb, yc), y_mm[0], step_y, len(y_mm))
         for k in range(first_k, end_k):
             for j in range(first_j, end_j):
                 direction, x = _crossing(vertices, a, b, c, y_mm[j], z_mm[k])
@@ -111,3 +127,28 @@ def _count_crossings(vertices, triangles, x_mm, y_mm, z_mm, winding):  # type: i
                     behind = math.ceil((x - x_mm[0]) / step_x)
                     behind = min(max(behind, 0), len(x_mm))
                     winding[k, j, behind] -= direction
+    return not _accumulate(winding, first, end)
+
+
+@njit(nogil=True, cache=True)
+def _accumulate(winding, first, end):  # type: ignore[no-untyped-def]
+    """Sum the crossings along the rows; how many rows do not end outside."""
+    open_rows = 0
+    for k in range(first, end):
+        for j in range(winding.shape[1]):
+            total = 0
+            for i in range(winding.shape[2]):
+                total += winding[k, j, i]
+                winding[k, j, i] = total
+            open_rows += total != 0
+    return open_rows
+
+
+@njit(nogil=True, cache=True)
+def _negate(winding, distance, first, end):  # type: ignore[no-untyped-def]
+    """Make the distance negative where the surface winds around."""
+    for k in range(first, end):
+        for j in range(distance.shape[1]):
+            for i in range(distance.shape[2]):
+                if winding[k, j, i] > 0:
+                    distance[k, j, i] = -distance[k, j, i]

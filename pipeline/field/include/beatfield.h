@@ -71,6 +71,7 @@ typedef struct {
 typedef struct {
     int shape[3]; /* nodes along x, y, z */
     double origin_mm[3], spacing_mm[3];
+    double per_mm[3]; /* nodes a millimetre */
     int phases;
     double *phase;       /* stored phases, rising in [0, 1) */
     double *line;        /* four numbers a phase: where which weights hold */
@@ -81,6 +82,7 @@ typedef struct {
     bf_structure_part *structure;
     bf_fixture_part *fixture;
     size_t bytes; /* of one phase of one array */
+    int wide;     /* whether the processor reads four nodes at a time */
 } bf_field;
 
 /* What a status means, in a few words. */
@@ -105,6 +107,13 @@ int bf_fixture(const bf_field *field, const char *name);
 /* Signed distance in mm and its gradient; either may be NULL. */
 bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
                       double *distance_mm, double gradient[3]);
+
+/* The same at many points, (count, 3) numbers; phases has one number, or count of them. Scratch may
+ * be NULL; with room for count numbers there, questions are answered in an order of its own, which
+ * is quicker if they are many and neither places nor phases follow one another. */
+bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
+                       const double *phases, size_t phase_count, double *distances_mm,
+                       double *gradients, unsigned *scratch);
 
 /* Potential of a fixture, in [0, 1). */
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
@@ -176,6 +185,12 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
+#endif
+/* Where the compiler can make code for a processor that it only may meet, four nodes of a row are
+ * read at a time if the processor can; BEATFIELD_PLAIN leaves that out. */
+#if defined(__GNUC__) && defined(__x86_64__) && !defined(BEATFIELD_PLAIN)
+#define BF__WIDE __attribute__((target("avx2,fma")))
+#include <immintrin.h>
 #endif
 
 const char *bf_text(bf_status status)
@@ -414,12 +429,24 @@ static void bf__grid(bf__json *j, bf_field *field)
         else bf__skip(j, 0);
     }
     for (axis = 0; axis < 3; axis++) {
-        if (!(shape[2 - axis] >= 2 && shape[2 - axis] <= 65536)) j->bad = 1;
+        if (!(shape[2 - axis] >= 2 && shape[2 - axis] <= 65536) || shape[2 - axis] != floor(shape[2 - axis]))
+            j->bad = 1;
         else field->shape[axis] = (int)shape[2 - axis];
         if (!(field->spacing_mm[axis] > 1e-6 && field->spacing_mm[axis] < 1e6)) j->bad = 1;
         if (!(fabs(field->origin_mm[axis]) < 1e9)) j->bad = 1;
     }
-    if (found != 9) j->bad = 1;
+    /* Its bytes must be countable, with 32 bits too. */
+    if (found != 9 || shape[0] * shape[1] * shape[2] > (double)(((size_t)-1) / 8)) j->bad = 1;
+}
+
+/* What queries need of the grid and of the processor. */
+static void bf__scale(bf_field *field)
+{
+    int axis;
+    for (axis = 0; axis < 3; axis++) field->per_mm[axis] = 1 / field->spacing_mm[axis];
+#ifdef BF__WIDE
+    field->wide = field->shape[0] >= 4 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#endif
 }
 
 static void bf__phases(bf__json *j, bf_field *field)
@@ -605,6 +632,7 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
     }
     field->bytes = sizeof(float) * (size_t)field->shape[0] * (size_t)field->shape[1] *
                    (size_t)field->shape[2];
+    bf__scale(field);
     status = bf__timeline(field);
     if (status != BF_OK) bf_close(field);
     return status;
@@ -983,62 +1011,198 @@ static void bf__three(double place, int count, ptrdiff_t index[3], double weight
     }
 }
 
-static int bf__moment(const bf_field *field, double phase, double weight[3])
+/* The interval that a phase lies in, and the phase brought to it. */
+static int bf__interval(const bf_field *field, double phase, double *turned)
 {
     const double *line = field->line;
-    double first = line[0], turned = phase - floor(phase - first), early, late;
-    int low = 0, high = field->phases;
-    if (turned >= first + 1) turned -= 1;
-    while (high - low > 1) {
-        int middle = (low + high) / 2;
-        if (line[4 * middle] <= turned) low = middle;
-        else high = middle;
+    double first = line[0], found = phase;
+    int low, high = field->phases;
+    if (!(found >= first && found < first + 1)) {
+        found -= floor(phase - first);
+        if (found >= first + 1) found -= 1;
     }
-    early = line[4 * low + 1] - turned;
-    late = turned - line[4 * low];
-    weight[0] = early * early * line[4 * low + 2];
-    weight[2] = late * late * line[4 * low + 3];
-    weight[1] = 1 - weight[0] - weight[2];
+    *turned = found;
+    /* Phases are mostly evenly spaced; where they are not, halving finds the interval. */
+    low = (int)((found - first) * high);
+    if (low < 0 || low >= high || line[4 * low] > found || line[4 * low + 1] <= found) {
+        for (low = 0; high - low > 1;) {
+            int middle = (low + high) / 2;
+            if (line[4 * middle] <= found) low = middle;
+            else high = middle;
+        }
+    }
     return low;
+}
+
+/* The same, and the weights of the interval's three phases. */
+static int bf__moment(const bf_field *field, double phase, double weight[3])
+{
+    double turned, early, late;
+    int k = bf__interval(field, phase, &turned);
+    const double *line = field->line + 4 * k;
+    early = line[1] - turned;
+    late = turned - line[0];
+    weight[0] = early * early * line[2];
+    weight[2] = late * late * line[3];
+    weight[1] = 1 - weight[0] - weight[2];
+    return k;
+}
+
+/* Where a question falls: the nodes, the weights, and the coefficients of three phases. */
+typedef struct {
+    double time[3], wx[3], wy[3], wz[3], sx[3], sy[3], sz[3];
+    ptrdiff_t ix[3], iy[3], iz[3];
+    const float *phase[3];
+} bf__place;
+
+static void bf__locate(const bf_field *field, int structure, const double point_mm[3], double phase,
+                       bf__place *at)
+{
+    const float *const *all = (const float *const *)field->structure[structure].coefficients;
+    int k = bf__moment(field, phase, at->time);
+    at->phase[0] = all[k > 0 ? k - 1 : field->phases - 1];
+    at->phase[1] = all[k];
+    at->phase[2] = all[k + 1 < field->phases ? k + 1 : 0];
+    bf__three((point_mm[0] - field->origin_mm[0]) * field->per_mm[0], field->shape[0], at->ix, at->wx, at->sx);
+    bf__three((point_mm[1] - field->origin_mm[1]) * field->per_mm[1], field->shape[1], at->iy, at->wy, at->sy);
+    bf__three((point_mm[2] - field->origin_mm[2]) * field->per_mm[2], field->shape[2], at->iz, at->wz, at->sz);
+}
+
+#ifdef BF__WIDE
+/* Weights of three neighbours along x as those of four nodes from base on. */
+BF__WIDE static __m256d bf__four(const double weight[3], ptrdiff_t left)
+{
+    double spread[6] = {0, 0, 0, 0, 0, 0};
+    if (left == 0) return _mm256_setr_pd(weight[0], weight[1], weight[2], 0);
+    /* At the ends: one neighbour is a ghost without weight. */
+    memcpy(spread + 1 + left, weight, 3 * sizeof(double));
+    return _mm256_loadu_pd(spread + 1);
+}
+
+/* bf__sum by rows of four nodes, summed along x last. */
+BF__WIDE static double bf__wide_sum(const bf_field *field, const bf__place *at, double gradient[3])
+{
+    ptrdiff_t width = field->shape[0], layer = width * field->shape[1], base, left;
+    __m256d t0, t1, t2, wx, sx, value, along_y, along_z, low, high;
+    double found[4];
+    int b, c;
+    base = at->ix[1] - 1 < 0 ? 0 : at->ix[1] - 1 > width - 4 ? width - 4 : at->ix[1] - 1;
+    left = at->ix[1] - 1 - base;
+    t0 = _mm256_set1_pd(at->time[0]);
+    t1 = _mm256_set1_pd(at->time[1]);
+    t2 = _mm256_set1_pd(at->time[2]);
+    value = along_y = along_z = _mm256_setzero_pd();
+    for (c = 0; c < 3; c++) {
+        __m256d plane = _mm256_setzero_pd(), plane_y = _mm256_setzero_pd(), wz = _mm256_set1_pd(at->wz[c]);
+        for (b = 0; b < 3; b++) {
+            ptrdiff_t row = at->iz[c] * layer + at->iy[b] * width + base;
+            __m256d nodes = _mm256_mul_pd(t0, _mm256_cvtps_pd(_mm_loadu_ps(at->phase[0] + row)));
+            nodes = _mm256_fmadd_pd(t1, _mm256_cvtps_pd(_mm_loadu_ps(at->phase[1] + row)), nodes);
+            nodes = _mm256_fmadd_pd(t2, _mm256_cvtps_pd(_mm_loadu_ps(at->phase[2] + row)), nodes);
+            plane = _mm256_fmadd_pd(_mm256_set1_pd(at->wy[b]), nodes, plane);
+            plane_y = _mm256_fmadd_pd(_mm256_set1_pd(at->sy[b]), nodes, plane_y);
+        }
+        value = _mm256_fmadd_pd(wz, plane, value);
+        along_y = _mm256_fmadd_pd(wz, plane_y, along_y);
+        along_z = _mm256_fmadd_pd(_mm256_set1_pd(at->sz[c]), plane, along_z);
+    }
+    wx = bf__four(at->wx, left);
+    sx = bf__four(at->sx, left);
+    low = _mm256_hadd_pd(_mm256_mul_pd(value, wx), _mm256_mul_pd(value, sx));
+    high = _mm256_hadd_pd(_mm256_mul_pd(along_y, wx), _mm256_mul_pd(along_z, wx));
+    _mm256_storeu_pd(found, _mm256_add_pd(_mm256_permute2f128_pd(low, high, 0x20),
+                                          _mm256_permute2f128_pd(low, high, 0x31)));
+    gradient[0] = found[1] * field->per_mm[0];
+    gradient[1] = found[2] * field->per_mm[1];
+    gradient[2] = found[3] * field->per_mm[2];
+    return found[0];
+}
+#endif
+
+/* Distance and gradient at a place. */
+static double bf__sum(const bf_field *field, const bf__place *at, double gradient[3])
+{
+    ptrdiff_t width = field->shape[0], layer = width * field->shape[1];
+    double value = 0;
+    int b, c;
+#ifdef BF__WIDE
+    if (field->wide) return bf__wide_sum(field, at, gradient);
+#endif
+    gradient[0] = gradient[1] = gradient[2] = 0;
+    for (c = 0; c < 3; c++) {
+        double plane = 0, plane_x = 0, plane_y = 0;
+        for (b = 0; b < 3; b++) {
+            double node[3], line;
+            int a;
+            for (a = 0; a < 3; a++) {
+                ptrdiff_t n = at->iz[c] * layer + at->iy[b] * width + at->ix[a];
+                node[a] = at->time[0] * at->phase[0][n] + at->time[1] * at->phase[1][n] +
+                          at->time[2] * at->phase[2][n];
+            }
+            line = at->wx[0] * node[0] + at->wx[1] * node[1] + at->wx[2] * node[2];
+            plane += at->wy[b] * line;
+            plane_x += at->wy[b] * (at->sx[0] * node[0] + at->sx[1] * node[1] + at->sx[2] * node[2]);
+            plane_y += at->sy[b] * line;
+        }
+        value += at->wz[c] * plane;
+        gradient[0] += at->wz[c] * plane_x;
+        gradient[1] += at->wz[c] * plane_y;
+        gradient[2] += at->sz[c] * plane;
+    }
+    gradient[0] *= field->per_mm[0];
+    gradient[1] *= field->per_mm[1];
+    gradient[2] *= field->per_mm[2];
+    return value;
 }
 
 /* Distance, and gradient, at a point whose numbers are finite. */
 static double bf__at(const bf_field *field, int structure, const double point_mm[3], double phase,
                      double gradient[3])
 {
-    const float *const *all = (const float *const *)field->structure[structure].coefficients;
-    const float *p0, *p1, *p2;
-    double time[3], wx[3], wy[3], wz[3], sx[3], sy[3], sz[3], value = 0;
-    ptrdiff_t ix[3], iy[3], iz[3], width = field->shape[0], layer = width * field->shape[1];
-    int b, c, k = bf__moment(field, phase, time);
-    p0 = all[k > 0 ? k - 1 : field->phases - 1];
-    p1 = all[k];
-    p2 = all[k + 1 < field->phases ? k + 1 : 0];
-    bf__three((point_mm[0] - field->origin_mm[0]) / field->spacing_mm[0], field->shape[0], ix, wx, sx);
-    bf__three((point_mm[1] - field->origin_mm[1]) / field->spacing_mm[1], field->shape[1], iy, wy, sy);
-    bf__three((point_mm[2] - field->origin_mm[2]) / field->spacing_mm[2], field->shape[2], iz, wz, sz);
-    gradient[0] = gradient[1] = gradient[2] = 0;
-    for (c = 0; c < 3; c++) {
-        double plane = 0, plane_x = 0, plane_y = 0;
-        for (b = 0; b < 3; b++) {
-            ptrdiff_t row = iz[c] * layer + iy[b] * width;
-            double n0 = time[0] * p0[row + ix[0]] + time[1] * p1[row + ix[0]] + time[2] * p2[row + ix[0]];
-            double n1 = time[0] * p0[row + ix[1]] + time[1] * p1[row + ix[1]] + time[2] * p2[row + ix[1]];
-            double n2 = time[0] * p0[row + ix[2]] + time[1] * p1[row + ix[2]] + time[2] * p2[row + ix[2]];
-            double line = wx[0] * n0 + wx[1] * n1 + wx[2] * n2;
-            plane += wy[b] * line;
-            plane_x += wy[b] * (sx[0] * n0 + sx[1] * n1 + sx[2] * n2);
-            plane_y += sy[b] * line;
-        }
-        value += wz[c] * plane;
-        gradient[0] += wz[c] * plane_x;
-        gradient[1] += wz[c] * plane_y;
-        gradient[2] += sz[c] * plane;
+    bf__place at;
+    bf__locate(field, structure, point_mm, phase, &at);
+    return bf__sum(field, &at, gradient);
+}
+
+enum { BF__BINS = 4096, BF__AHEAD = 16, BF__CACHE = 1 << 19 };
+
+/* Into which of the bins a question falls: by phase first, then by height. */
+static int bf__bin(const bf_field *field, double z_mm, double phase, int slabs)
+{
+    double turned, place = (z_mm - field->origin_mm[2]) * field->per_mm[2] / field->shape[2];
+    int k = bf__interval(field, phase, &turned);
+    return k * slabs + (place > 0 ? place < 1 ? (int)(place * slabs) : slabs - 1 : 0);
+}
+
+/* Numbers of the questions, those about neighbouring coefficients after one another (a counting
+ * sort): random questions then find in the cache what others have read. */
+static void bf__sort(const bf_field *field, size_t count, const double *points_mm, const double *phases,
+                     size_t phase_count, unsigned *order)
+{
+    unsigned start[BF__BINS], sum = 0;
+    int most = BF__BINS / field->phases, slabs = 1 + (int)(3 * field->bytes / BF__CACHE), bin;
+    size_t n;
+    if (slabs > most) slabs = most;
+    memset(start, 0, sizeof start);
+    for (n = 0; n < count; n++)
+        start[bf__bin(field, points_mm[3 * n + 2], phases[phase_count == 1 ? 0 : n], slabs)]++;
+    for (bin = 0; bin < slabs * field->phases; bin++) {
+        unsigned here = start[bin];
+        start[bin] = sum;
+        sum += here;
     }
-    gradient[0] /= field->spacing_mm[0];
-    gradient[1] /= field->spacing_mm[1];
-    gradient[2] /= field->spacing_mm[2];
-    return value;
+    for (n = 0; n < count; n++)
+        order[start[bf__bin(field, points_mm[3 * n + 2], phases[phase_count == 1 ? 0 : n], slabs)]++] =
+            (unsigned)n;
+}
+
+static void bf__fetch(const void *address)
+{
+#ifdef __GNUC__
+    __builtin_prefetch(address);
+#else
+    (void)address;
+#endif
 }
 
 static double bf__height(const bf_fixture_part *law, double distance_mm)
@@ -1052,14 +1216,12 @@ static double bf__height(const bf_fixture_part *law, double distance_mm)
     return -expm1(-power);
 }
 
-static void bf__force_at(const bf_field *field, const bf_fixture_part *law, const double point_mm[3],
-                         double phase, double force_n[3])
+/* The force where the distance and its gradient are known. */
+static void bf__push(const bf_fixture_part *law, double distance_mm, const double gradient[3], double force_n[3])
 {
-    double gradient[3], length, scale;
-    double distance = bf__at(field, law->structure, point_mm, phase, gradient);
-    length = sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1] + gradient[2] * gradient[2]);
-    scale = -law->f_max_n * bf__height(law, distance) / (length > 0.5 ? length : 0.5);
-    if (law->side == 0 ? distance < 0 : law->side < 0) scale = -scale;
+    double length = sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1] + gradient[2] * gradient[2]);
+    double scale = -law->f_max_n * bf__height(law, distance_mm) / (length > 0.5 ? length : 0.5);
+    if (law->side == 0 ? distance_mm < 0 : law->side < 0) scale = -scale;
     force_n[0] = scale * gradient[0];
     force_n[1] = scale * gradient[1];
     force_n[2] = scale * gradient[2];
@@ -1084,6 +1246,42 @@ bf_status bf_distance(const bf_field *field, int structure, const double point_m
     return BF_OK;
 }
 
+/* Whether all questions of a batch can be asked. */
+static bf_status bf__askable(size_t count, const double *points_mm, const double *phases, size_t phase_count)
+{
+    size_t n;
+    if (phase_count != 1 && phase_count != count) return BF_WRONG_SIZE;
+    for (n = 0; n < count; n++)
+        if (!bf__finite(points_mm + 3 * n, phases[phase_count == 1 ? 0 : n])) return BF_NOT_FINITE;
+    return BF_OK;
+}
+
+bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
+                       const double *phases, size_t phase_count, double *distances_mm,
+                       double *gradients, unsigned *scratch)
+{
+    size_t n;
+    bf_status status;
+    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
+    if (scratch && count > 0xffffffffu) return BF_WRONG_SIZE;
+    status = bf__askable(count, points_mm, phases, phase_count);
+    if (status != BF_OK) return status;
+    if (scratch) bf__sort(field, count, points_mm, phases, phase_count, scratch);
+    for (n = 0; n < count; n++) {
+        size_t one = scratch ? scratch[n] : n;
+        if (scratch && n + BF__AHEAD < count) {
+            size_t soon = scratch[n + BF__AHEAD];
+            bf__fetch(points_mm + 3 * soon);
+            bf__fetch(distances_mm + soon);
+            bf__fetch(gradients + 3 * soon);
+            if (phase_count > 1) bf__fetch(phases + soon);
+        }
+        distances_mm[one] = bf__at(field, structure, points_mm + 3 * one, phases[phase_count == 1 ? 0 : one],
+                                   gradients + 3 * one);
+    }
+    return status;
+}
+
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential)
 {
@@ -1099,24 +1297,31 @@ bf_status bf_potential(const bf_field *field, int fixture, const double point_mm
 bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
                    double force_n[3])
 {
+    double slope[3], distance;
+    const bf_fixture_part *law;
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
     if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
-    bf__force_at(field, &field->fixture[fixture], point_mm, phase, force_n);
+    law = &field->fixture[fixture];
+    distance = bf__at(field, law->structure, point_mm, phase, slope);
+    bf__push(law, distance, slope, force_n);
     return BF_OK;
 }
 
 bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
                     const double *phases, size_t phase_count, double *forces_n)
 {
+    const bf_fixture_part *law;
+    double distance_mm, gradient[3];
     size_t n;
+    bf_status status;
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
-    if (phase_count != 1 && phase_count != count) return BF_WRONG_SIZE;
-    for (n = 0; n < count; n++)
-        if (!bf__finite(points_mm + 3 * n, phases[phase_count == 1 ? 0 : n])) return BF_NOT_FINITE;
-    for (n = 0; n < count; n++)
-        bf__force_at(field, &field->fixture[fixture], points_mm + 3 * n,
-                     phases[phase_count == 1 ? 0 : n], forces_n + 3 * n);
-    return BF_OK;
+    status = bf__askable(count, points_mm, phases, phase_count);
+    law = &field->fixture[fixture];
+    for (n = 0; status == BF_OK && n < count; n++) {
+        distance_mm = bf__at(field, law->structure, points_mm + 3 * n, phases[phase_count == 1 ? 0 : n], gradient);
+        bf__push(law, distance_mm, gradient, forces_n + 3 * n);
+    }
+    return status;
 }
 
 void bf_transform(const double t[16], const double point_mm[3], double moved_mm[3])
@@ -1178,17 +1383,12 @@ typedef struct {
 
 static void bf__ask(bf__walk *walk, double along_mm, bf__feel *feel)
 {
-    double moved[3], gradient[3], length, scale;
+    double moved[3], gradient[3];
     const bf_fixture_part *law = walk->law;
     bf__point(walk, along_mm, feel->point_mm);
     bf_transform(walk->mr_from_tool, feel->point_mm, moved);
     feel->distance_mm = bf__at(walk->field, law->structure, moved, walk->phase, gradient);
-    length = sqrt(gradient[0] * gradient[0] + gradient[1] * gradient[1] + gradient[2] * gradient[2]);
-    scale = -law->f_max_n * bf__height(law, feel->distance_mm) / (length > 0.5 ? length : 0.5);
-    if (law->side == 0 ? feel->distance_mm < 0 : law->side < 0) scale = -scale;
-    feel->force_n[0] = scale * gradient[0];
-    feel->force_n[1] = scale * gradient[1];
-    feel->force_n[2] = scale * gradient[2];
+    bf__push(law, feel->distance_mm, gradient, feel->force_n);
     walk->evaluations++;
 }
 

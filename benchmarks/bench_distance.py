@@ -1,0 +1,227 @@
+"""Closed mesh to signed grid: seconds and errors beside exact libraries, and the curve of cost.
+
+    python benchmarks/bench_distance.py                    # the table, 2-3 minutes on 2 cores
+    python benchmarks/bench_distance.py --triangles 100000 --nodes 256
+    python benchmarks/bench_distance.py --curve            # ours alone, a minute
+    python benchmarks/bench_distance.py --mesh cup.npz     # arrays v (n, 3) and f (m, 3)
+
+Peers are libigl, Open3D and VTK; one that cannot be imported is left out. They are no
+dependencies of this project: install them into an environment of their own that has numba, SciPy
+and scikit-image too (``pip install libigl open3d vtk numba scipy scikit-image``), and run this
+file with its Python. Everybody uses all processors that it would use by itself, and pays for its
+own tree, signs and query points; compilation, imports and meshes are outside. Runs alternate, ours
+before and after every peer's, and the least time of each counts. ``core-s`` is processor time of
+all threads: where others use the machine, its ratios are the ones to trust. ``error`` is the
+largest difference to the first peer's distance, within 15 mm and beyond; ``signs`` counts nodes
+with another sign.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from pipeline.field.distance import distance_of_closed
+from pipeline.field.threads import processors
+from pipeline.geometry import Float, Float32, Grid, Surface
+
+CUBE_MM = 128.0
+BAND_MM = 15.0
+# VTK would need a minute or more: it is asked for every 64th node, and its time multiplied.
+VTK_SHARE = 64
+
+
+def cup(x: Float, y: Float, z: Float) -> Float:
+    """A thick-walled bumpy cup with lobes, about 100 mm across: negative inside, no distance."""
+
+    def ellipsoid(at: tuple[float, ...], radii: tuple[float, ...]) -> Float:
+        places = zip((x, y, z), at, radii, strict=True)
+        scaled = np.sqrt(sum(((p - c) / r) ** 2 for p, c, r in places))
+        return (scaled - 1) * min(radii)
+
+    def blend(p: Float, q: Float, width: float) -> Float:
+        t = np.clip(0.5 + 0.5 * (q - p) / width, 0, 1)
+        return q + (p - q) * t - width * t * (1 - t)
+
+    body = ellipsoid((0, 0, -4), (36, 33, 46))
+    for at, radii in (
+        ((26, 6, 2), (22, 26, 34)),
+        ((14, -14, 32), (20, 19, 18)),
+        ((-16, 12, 34), (19, 18, 16)),
+    ):
+        body = blend(body, ellipsoid(at, radii), 6.0)
+    body = -blend(-body, ellipsoid((-2, 0, 14), (21, 19, 44)), 4.0)
+    coarse = np.sin(0.31 * x + 0.4) * np.sin(0.27 * y) * np.sin(0.29 * z + 1)
+    fine = np.sin(0.9 * x) * np.sin(0.8 * y + 0.3) * np.sin(0.85 * z)
+    return body + 1.1 * coarse + 0.35 * fine
+
+
+def cup_surface(triangles: int) -> Surface:
+    """The cup by marching cubes, of about so many triangles."""
+    from skimage.measure import marching_cubes
+
+    step = 2.12 * np.sqrt(20108 / triangles)
+    count = int(np.ceil(120 / step))
+    axis = (np.arange(count) - 0.5 * (count - 1)) * step
+    values = cup(axis[:, None, None], axis[None, :, None], axis[None, None, :]).astype(np.float32)
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(step,) * 3)
+    surface = Surface(vertices.astype(np.float64) + axis[0], faces.astype(np.int64))
+    if surface.volume_mm3() < 0:
+        surface = Surface(surface.vertices_mm, surface.triangles[:, ::-1].copy())
+    return surface
+
+
+def read_surface(path: Path) -> Surface:
+    """The mesh of a .npz file."""
+    with np.load(path) as arrays:
+        return Surface(arrays["v"].astype(np.float64), arrays["f"].astype(np.int64))
+
+
+def cube(nodes: int) -> Grid:
+    """A grid of so many nodes a side."""
+    step = CUBE_MM / nodes
+    return Grid((nodes,) * 3, (0.5 * step - 0.5 * CUBE_MM,) * 3, (step,) * 3)
+
+
+Solver = Callable[[], Float | Float32]
+
+
+def libigl(surface: Surface, grid: Grid) -> tuple[Solver, int]:
+    """libigl's tree, sign by pseudonormals."""
+    import igl
+
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    return lambda: igl.signed_distance(
+        grid.nodes_mm().reshape(-1, 3), surface.vertices_mm, surface.triangles, kind
+    )[0], 1
+
+
+def open3d(surface: Surface, grid: Grid) -> tuple[Solver, int]:
+    """Open3D's ray-casting scene (Embree), sign by one ray."""
+    import open3d as o3d
+
+    def solve() -> Float32:
+        scene = o3d.t.geometry.RaycastingScene()
+        vertices = o3d.core.Tensor(surface.vertices_mm.astype(np.float32))
+        scene.add_triangles(vertices, o3d.core.Tensor(surface.triangles.astype(np.uint32)))
+        points = o3d.core.Tensor(grid.nodes_mm().reshape(-1, 3).astype(np.float32))
+        found: Float32 = scene.compute_signed_distance(points, nsamples=1).numpy()
+        return found
+
+    return solve, 1
+
+
+def vtk(surface: Surface, grid: Grid) -> tuple[Solver, int]:
+    """VTK's implicit distance, for every 64th node."""
+    import vtkmodules.vtkFiltersCore  # noqa: F401
+
+    from pipeline.field.exact import vtk_distance
+
+    return lambda: vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)[::VTK_SHARE]), VTK_SHARE
+
+
+PEERS = {"libigl": libigl, "open3d": open3d, "vtk": vtk}
+
+
+def timed(solve: Solver) -> tuple[Float, Float | Float32]:
+    """Seconds by the clock and of all processors together; and what came out, as one row."""
+    start = np.array([time.perf_counter(), time.process_time()])
+    found = solve()
+    end = np.array([time.perf_counter(), time.process_time()])
+    return end - start, found.reshape(-1)
+
+
+def compare(surface: Surface, grid: Grid, rounds: int, peers: Sequence[str]) -> None:
+    """Print a row for ours and for every peer."""
+    print(f"\n{len(surface.triangles)} triangles, {grid.shape[0]}^3 nodes, {processors()} cores")
+    print("| method | s | times ours | core-s | times ours | error <= 15 mm | beyond | signs |")
+    print("|---" * 8 + "|")
+    distance_of_closed(surface, cube(8))
+    best, ours = timed(lambda: distance_of_closed(surface, grid))
+    rows, exact = {}, None
+    for peer in peers:
+        try:
+            solve, share = PEERS[peer](surface, grid)
+        except ImportError:
+            continue
+        least = np.full(2, np.inf)
+        for _ in range(rounds):
+            seconds, found = timed(solve)
+            least = np.minimum(least, share * seconds)
+            for _ in range(2):
+                best = np.minimum(best, timed(lambda: distance_of_closed(surface, grid))[0])
+        rows[peer] = least, found, share
+        exact = (found, share) if exact is None else exact
+    rows = {"ours": (best, ours, 1), **rows}
+    for name, (seconds, found, share) in rows.items():
+        cells = [f"{s:.3f} | {ratio:.1f}" for s, ratio in zip(seconds, seconds / best, strict=True)]
+        print(f"| {name} | {' | '.join(cells)} | {errors(found, share, exact)} |", flush=True)
+
+
+def errors(found: Float | Float32, share: int, exact: tuple[Float | Float32, int] | None) -> str:
+    """Differences to the exact distances, as cells of the table."""
+    if exact is None:
+        return "- | - | -"
+    truth, truth_share = exact
+    if share < truth_share:
+        found = found[:: truth_share // share]
+    else:
+        truth = truth[:: share // truth_share]
+    difference = np.abs(found - truth)
+    near = np.abs(truth) <= BAND_MM
+    signs = ((found < 0) != (truth < 0)) & (np.abs(truth) > 1e-9)
+    return f"{difference[near].max():.1e} | {difference[~near].max():.1e} | {signs.sum()}"
+
+
+def curve(rounds: int) -> None:
+    """Print our time against nodes and triangles, and the plane through it."""
+    cases = [(100_000, n) for n in (64, 96, 128, 192, 256)]
+    cases += [(t, 128) for t in (5_000, 20_000, 50_000, 200_000, 400_000)]
+    print("\n| triangles | nodes | s | ns a node |\n" + "|---" * 4 + "|")
+    terms, seconds = [], []
+    for wanted, nodes in cases:
+        surface, grid = cup_surface(wanted), cube(nodes)
+        distance_of_closed(surface, cube(8))
+        runs = [timed(partial(distance_of_closed, surface, grid))[0] for _ in range(rounds)]
+        least = float(min(run[0] for run in runs))
+        terms.append((nodes**3, len(surface.triangles)))
+        seconds.append(least)
+        print(f"| {terms[-1][1]} | {nodes}^3 | {least:.3f} | {least / nodes**3 * 1e9:.0f} |")
+    share, *_ = np.linalg.lstsq(np.array(terms) / np.array(seconds)[:, None], np.ones(len(cases)))
+    off = np.array(terms) @ share / seconds - 1
+    print(
+        f"seconds = {share[0] * 1e9:.0f}e-9 nodes + {share[1] * 1e6:.2f}e-6 triangles, "
+        f"off by {off.min():+.0%} to {off.max():+.0%}"
+    )
+
+
+def main() -> None:
+    """Read the command line and measure."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--triangles", type=int, nargs="*", default=[20_000, 100_000, 400_000])
+    parser.add_argument("--mesh", type=Path, nargs="*", help="files instead of the cup")
+    parser.add_argument("--nodes", type=int, default=128, help="a side of the grid")
+    parser.add_argument("--rounds", type=int, default=2, help="runs of each")
+    parser.add_argument("--peers", nargs="*", choices=PEERS, default=list(PEERS))
+    parser.add_argument("--curve", action="store_true", help="ours alone, against size")
+    args = parser.parse_args()
+    if args.curve:
+        curve(args.rounds)
+        return
+    for what in args.mesh or args.triangles:
+        surface = read_surface(what) if isinstance(what, Path) else cup_surface(what)
+        compare(surface, cube(args.nodes), args.rounds, args.peers)
+
+
+if __name__ == "__main__":
+    main()

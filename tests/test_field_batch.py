@@ -1,0 +1,130 @@
+"""Both readers against the formula of docs/field.md in plain NumPy, on grids of any width."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.field import ForceField, get_include
+from pipeline.field.fixture import Fixture
+from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
+from pipeline.field.store import FieldWriter
+from pipeline.geometry import Float
+
+DRIVER = Path(__file__).parent / "field_batch_driver.c"
+ORIGIN_MM = (-3.0, 4.0, 5.5)
+SPACING_MM = (1.5, 2.0, 0.7)
+WAYS = {"four at a time": [], "one at a time": ["-DBEATFIELD_PLAIN"]}
+EVEN = np.arange(25) / 25
+UNEVEN = np.array([0.01, 0.02, 0.021, 0.4, 0.97])
+
+
+def write_random(path: Path, width: int, phases: Float) -> Float:
+    """A store with random coefficients; no surface has such a distance, but no weight can hide."""
+    shape = (3, 5, width)
+    law = Fixture(structure="s", kind="guidance", delta_mm=3.0, f_max_n=1.0)
+    about = FieldMetadata(
+        phases=phases.tolist(),
+        rr_s=None,
+        mr_from_tracker=None,
+        grid=GridPart(shape_zyx=shape, origin_mm=ORIGIN_MM, spacing_mm=SPACING_MM),
+        structures={
+            "s": StructurePart(path="distance/s", spline="spline/s", triangles=[], volume_ml=[])
+        },
+        fixtures={"f": FixturePart.of("f", law)},
+        source={},
+        accuracy={},
+    )
+    values = np.random.default_rng(width).normal(size=(len(phases), *shape)).astype(np.float32)
+    writer = FieldWriter(path, about)
+    for index, one in enumerate(values):
+        for part in about.arrays:
+            writer.write(part, index, one)
+    writer.finish(about)
+    return values.astype(float)
+
+
+def weights(offset: Float) -> tuple[Float, Float]:
+    """Of the node before the nearest, the nearest, and the next; and their slopes."""
+    values = [(0.5 - offset) ** 2 / 2, 0.75 - offset**2, (0.5 + offset) ** 2 / 2]
+    return np.array(values), np.array([offset - 0.5, -2 * offset, offset + 0.5])
+
+
+def by_the_text(values: Float, phases: Float, point: Float, phase: float) -> Float:
+    """Distance and gradient, as docs/field.md tells a third program to compute them."""
+    ghosts = values
+    for axis in (1, 2, 3):
+        line = np.moveaxis(ghosts, axis, 0)
+        line = np.concatenate([[2 * line[0] - line[1]], line, [2 * line[-1] - line[-2]]])
+        ghosts = np.moveaxis(line, 0, axis)
+    middle = (phases + np.append(phases[1:], phases[0] + 1)) / 2
+    turned = phase - np.floor(phase - (middle[-1] - 1))
+    knots = np.concatenate([middle + turn for turn in range(-2, 3)])
+    k = int(np.searchsorted(knots, turned, side="right")) - 1
+    a, b, c, d = knots[k - 1 : k + 3]
+    early = (c - turned) ** 2 / ((c - b) * (c - a))
+    late = (turned - b) ** 2 / ((c - b) * (d - b))
+    count = len(phases)
+    # Knot k of the list opens the interval about phase k + 1.
+    about = (k + 1) % count
+    shares = zip((early, 1 - early - late, late), (about - 1, about, about + 1), strict=True)
+    moment = sum(share * ghosts[n % count] for share, n in shares)
+    nodes = np.array(values.shape[:0:-1])
+    place = np.clip((point - ORIGIN_MM) / SPACING_MM, 0, nodes - 1)
+    nearest = np.minimum(np.floor(place + 0.5), nodes - 1).astype(int)
+    (wx, wy, wz), (sx, sy, sz) = (
+        [part[:, axis] for axis in range(3)] for part in weights(place - nearest)
+    )
+    i, j, n = nearest + 1
+    box = moment[n - 1 : n + 2, j - 1 : j + 2, i - 1 : i + 2]
+    sums = [(wz, wy, wx), (wz, wy, sx / SPACING_MM[0])]
+    sums += [(wz, sy / SPACING_MM[1], wx), (sz / SPACING_MM[2], wy, wx)]
+    return np.array([np.einsum("kji,k,j,i", box, *one) for one in sums])
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """The driver built for each way of reading, watched by sanitizers."""
+    if shutil.which("gcc") is None:
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("batch")
+    for name, options in WAYS.items():
+        command = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", *options]
+        command += ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+        target = str(folder / name)
+        command += [f"-I{get_include()}", str(DRIVER), "-o", target, "-lm"]
+        subprocess.run(command, check=True)
+    return {name: folder / name for name in WAYS}
+
+
+@pytest.mark.parametrize("phases", [EVEN, UNEVEN, UNEVEN[:2], UNEVEN[:1]], ids=len)
+@pytest.mark.parametrize("width", [2, 3, 4, 5, 9])
+def test_every_reader_follows_the_text(tmp_path, programs, width, phases):
+    path = tmp_path / "field.zarr"
+    values = write_random(path, width, phases)
+    rng = np.random.default_rng(width)
+    low = np.array(ORIGIN_MM)
+    high = low + (np.array([width, 5, 3]) - 1) * SPACING_MM
+    # Some beyond the grid, some on its boundary, some at the very knots of time.
+    points = np.clip(rng.uniform(low - 1, high + 1, (300, 3)), low - 0.5, high + 0.5)
+    moments = rng.uniform(-1, 2, len(points))
+    moments[:50] = rng.choice(phases, 50)
+    moments[50:100] = rng.choice((phases + np.roll(phases, 1)) / 2, 50)
+    expected = np.array(
+        [by_the_text(values, phases, p, t) for p, t in zip(points, moments, strict=True)]
+    )
+    # A few dozen products of numbers of order 1, over a spacing of 0.7 mm.
+    close = {"rtol": 0, "atol": 1e-12 * np.abs(values).max()}
+
+    field = ForceField.open(path)
+    np.testing.assert_allclose(field.distance_mm(points, moments), expected[:, 0], **close)
+    np.testing.assert_allclose(field.gradient(points, moments), expected[:, 1:], **close)
+    questions = np.column_stack([points, moments]).tobytes()
+    for program in programs.values():
+        done = subprocess.run([program, path], input=questions, capture_output=True, check=False)
+        assert (done.returncode, done.stderr) == (0, b"")
+        found = np.frombuffer(done.stdout)
+        np.testing.assert_allclose(found[: len(points)], expected[:, 0], **close)
+        np.testing.assert_allclose(found[len(points) :].reshape(-1, 3), expected[:, 1:], **close)
