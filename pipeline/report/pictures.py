@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from pipeline.field.fixture import Fixture
 from pipeline.field.potential import potential
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, Label, MovingSurface, Surface, transform_points
+from pipeline.geometry import Float, Float32, Label, MovingSurface, Surface, transform_points
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.labels import LABELS
 
@@ -131,14 +131,17 @@ def potential_on_slice(
 
 
 def cuts_on_ultrasound(
-    images: Float, image_from_mr: Float, phases: Float, surfaces: Mapping[str, MovingSurface]
+    images: Sequence[Float32],
+    image_from_mr: Float,
+    phases: Float,
+    surfaces: Mapping[str, MovingSurface],
 ) -> Figure:
     """Registered surfaces cut by the plane of each ultrasound frame.
 
     Parameters
     ----------
     images
-        ``(frame, row, column)``.
+        One a frame, ``(row, column)``; sizes may differ.
     image_from_mr
         ``(frame, 4, 4)``: MR millimetres to ``(column, row, off-plane)``.
     phases

@@ -123,7 +123,8 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     rows = [row for row in read_frames(folder / "frames.csv") if row.valid]
     chosen = [rows[k] for k in np.linspace(0, len(rows) - 1, ULTRASOUND_FRAMES_SHOWN).astype(int)]
     sweeps = {path.stem: read_sweep(path) for path in job.study.us.sweeps}
-    images = np.stack([sweeps[row.sweep].images[row.frame] for row in chosen])
+    # Probes differ, and so may the sizes of their pictures.
+    images = [sweeps[row.sweep].images[row.frame] for row in chosen]
     image_from_mr = np.stack(
         [
             np.linalg.inv(mr_from_tracker @ sweeps[row.sweep].tracker_from_image[row.frame])
