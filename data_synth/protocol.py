@@ -55,8 +55,8 @@ class MrSettings(BaseModel):
     through_plane_samples: int = Field(default=6, ge=1, le=32)
     """Points of a voxel that are averaged, each at its own depth, place and instant."""
     window_samples: int = Field(default=3, ge=1, le=9)
-    """Instants over the acquisition window of a frame (one phase step wide) that the points of a
-    voxel are spread over; 1 gives still frames."""
+    """Instants over the acquisition window of a frame (one phase step wide, at most 1/25 of the
+    beat) that the points of a voxel are spread over; 1 gives still frames."""
     breath_hold_shift_mm: float = Field(default=1.5, ge=0, le=10)
     """Standard deviation of the heart's place from one slice's breath-hold to another."""
     planning_error_deg: float = Field(default=3.0, ge=0, le=30)

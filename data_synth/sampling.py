@@ -23,6 +23,9 @@ FREQUENCY_STEP_HZ = 1.0
 LATTICE_MM, LATTICE_PHASES, MARGIN_MM = 4.2, 12, 4.0
 """Mesh and phases of the first look at where in a slice the heart is, and what is added to it: at
 12 phases of 0.8 s, a border that moves at 100 mm/s is never more than 3.3 mm off."""
+LONGEST_WINDOW = 0.04
+"""Share of the cycle beyond which a frame's acquisition window does not grow."""
+
 SEQUENCES = (0.7548776662466927, 0.5698402909980532, 0.6180339887498949)
 """Steps, modulo 1, of the orders in which samples take places along x, along y, and in time."""
 BLOOD = np.isin(np.arange(len(Tissue)), BLOOD_TISSUES)
@@ -201,7 +204,9 @@ class Slice:
         if sample >= 0:
             offset = self.offsets_mm[sample]
             instant = float(self.view.samples.instants[sample])
-        nominal = self._nominal(phase + instant / self.settings.phases)
+        # Few phases are a long cine of which few are kept, not frames of a third of a heartbeat.
+        window = min(1 / self.settings.phases, LONGEST_WINDOW)
+        nominal = self._nominal(phase + instant * window)
         return self.heart.heart_tissue(self.moved[which] + offset, nominal)
 
     def _mixed(self, middle: Label, probe: Label) -> npt.NDArray[np.intp]:

@@ -105,7 +105,7 @@ def _write_cine(folder: Path, study: SyntheticStudy) -> dict[str, str]:
     _write_cine_nifti(folder / "cine", "cine", "timing", study.cine)
     # Beside the stack's folder, for that holds one 4D file where nothing names it.
     for name, view in study.views.items():
-        _write_cine_nifti(folder / "cine" / "long_axis", name, f"{name}_timing", view)
+        _write_cine_nifti(folder / "long_axis", name, f"{name}_timing", view)
     return {"path": "cine/cine.nii.gz", "timing": "cine/timing.json"}
 
 

@@ -208,8 +208,8 @@ def test_nifti_cine_holds_the_same_images_as_dicom(study, tmp_path):
     for path, timing_path, series, z in (
         (cine / "cine.nii.gz", cine / "timing.json", 2, 1),
         (
-            cine / "long_axis" / "four_chamber.nii.gz",
-            cine / "long_axis" / "four_chamber_timing.json",
+            cine.parent / "long_axis" / "four_chamber.nii.gz",
+            cine.parent / "long_axis" / "four_chamber_timing.json",
             7,
             0,
         ),
@@ -240,7 +240,7 @@ def test_a_volume_is_written_with_isotropic_voxels(tmp_path):
     write_study(tmp_path / "p", settings)
     image = nibabel.load(tmp_path / "p" / "cine" / "cine.nii.gz")
     np.testing.assert_allclose(image.header.get_zooms()[:3], 5.0, rtol=1e-6)
-    assert not (tmp_path / "p" / "cine" / "long_axis").exists()
+    assert not (tmp_path / "p" / "long_axis").exists()
     labels = np.asarray(nibabel.load(tmp_path / "p" / "truth" / "labels_000.nii.gz").dataobj)
     known = json.loads((tmp_path / "p" / "truth" / "truth.json").read_text())
     counted_ml = (labels == TRUTH_LABELS["lv_cavity"][0]).sum() * 0.125

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import correlate1d
 
 from pipeline.field import ForceField
 
@@ -124,8 +125,21 @@ def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path
     delta, m, f_max_n = fixture["delta_mm"], fixture["m"], fixture["f_max_n"]
     expected = 1 - np.exp(-((distance_mm**2 / (2 * delta**2)) ** m))
     np.testing.assert_allclose(field.potential(points_mm, at, fixture=name), expected, atol=1e-5)
-    slope = np.stack(np.gradient(np.asarray(stored, dtype=float), *field.grid.spacing_mm), axis=-1)
-    gradient = slope[tuple(index.T)][:, ::-1]
+    # At a node and stored phase of a quadratic spline: 1/8, 6/8, 1/8 of the coefficients, and half
+    # the difference of the neighbours along the axis of the derivative.
+    spline = store / "spline" / fixture["structure"] / "c"
+    mean, half = np.array([1, 6, 1]) / 8, np.array([-0.5, 0, 0.5])
+    coefficients = sum(
+        weight * np.memmap(spline / str(phase + step) / "0/0/0", "<f4", "r", shape=shape[1:])
+        for step, weight in zip((-1, 0, 1), mean, strict=True)
+    )
+    slopes = []
+    for axis in (2, 1, 0):
+        values = np.asarray(coefficients, dtype=float)
+        for other in range(3):
+            values = correlate1d(values, half if other == axis else mean, axis=other)
+        slopes.append(values[tuple(index.T)] / field.grid.spacing_mm[2 - axis])
+    gradient = np.stack(slopes, axis=-1)
     length = np.linalg.norm(gradient, axis=1)
     clear = length > 0.6  # off the medial axis, where the direction is defined
     unit = np.sign(distance_mm)[:, None] * gradient / length[:, None]
