@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from pydantic import ValidationError
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
@@ -371,3 +371,21 @@ def test_blending_is_cyclic_and_keeps_the_sum():
     value[0] = 1
     blend_phases(value, 0.25)
     np.testing.assert_array_equal(value.ravel(), [0.5, 0.25, 0, 0.25])
+
+
+@pytest.mark.parametrize(("neck", "joined"), [(0.4, True), (0.02, False)])
+def test_an_auricle_is_joined_along_a_likely_neck_and_no_other(neck, joined):
+    """A body and a finger of left atrium, four pixels of doubt between them."""
+    atrium = LABELS["left_atrium"]
+    probability = np.zeros((5, 7, 40, 60), np.float32)
+    probability[:, 0] = 1.0
+    place = np.zeros((5, 40, 60), np.float32)
+    place[:, 10:30, 5:25] = place[1:4, 17:23, 29:45] = 0.95
+    place[2, 19:21, 25:29] = neck
+    probability[:, atrium], probability[:, 0] = place, 1 - place
+
+    found = clean_probability(probability).argmax(axis=1) == atrium
+
+    assert found[2, 20, 40] == joined
+    assert found[2, 20, 27] == joined
+    assert label(found, np.ones((3, 3, 3)))[1] == 1
