@@ -54,13 +54,10 @@ types: setup ## static types
 bench: setup ## speed beside peers, as ratios in one run
 	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
 
-train: setup ## make the segmentation weights anew from the phantom (two hours or so; needs PyTorch)
+train: setup ## make the segmentation weights anew from the phantom (an hour and a half; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(BIN)/python -m data_synth.training --out training --steps 6650
-	mkdir -p training/fine && ln -sfn ../pool training/fine/pool
-	$(BIN)/python -m data_synth.training --out training/fine --start training/heart.pt \
-		--learning-rate 1e-3 --overlap-weight 0.2 --steps 8000
-	cp training/fine/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(BIN)/python -m data_synth.training --out training
+	cp training/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
 	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)

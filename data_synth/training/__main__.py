@@ -1,23 +1,26 @@
-"""Command line of the training: `python -m data_synth.training --out training --steps 10000`."""
+"""Command line of the training: `python -m data_synth.training --out training`."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from data_synth.training.loop import TrainSettings, train
 from data_synth.training.pool import PoolSettings, fill_pool
+from data_synth.training.render import Parts
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Fill the pool, train, and leave `heart.onnx` in the folder given by `--out`."""
     options = _parser().parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
-    paths = fill_pool(options.out / "pool", pool, _say_pool)
+    paths = fill_pool(options.pool or options.out / "pool", pool, _say_pool, options.workers)
     if options.pool_only:
         return 0
     blocks = [block for path in paths for block in np.load(path)]
@@ -26,8 +29,8 @@ def main(arguments: list[str] | None = None) -> int:
         minutes=options.minutes,
         batch=options.batch,
         learning_rate=options.learning_rate,
-        overlap_weight=options.overlap_weight,
         start=options.start,
+        parts=Parts(**dict.fromkeys(options.without, False)),
         seed=options.seed,
         export_minutes=options.export_minutes,
         threads=options.threads,
@@ -47,16 +50,21 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m data_synth.training", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of pool and network")
-    parser.add_argument("--hearts", type=int, default=180, help="hearts in the pool")
+    parser.add_argument("--hearts", type=int, default=240, help="hearts in the pool")
     parser.add_argument("--spread", type=float, default=1.6, help="how far hearts are from mean")
-    parser.add_argument("--steps", type=int, default=8_000, help="batches to learn from")
+    parser.add_argument("--steps", type=int, default=16_000, help="batches to learn from")
     parser.add_argument("--batch", type=int, default=8, help="images in a batch")
     parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
-    parser.add_argument("--overlap-weight", type=float, default=1.0, help="of the Dice term")
     parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
+    parser.add_argument(
+        "--without", action="append", default=[], choices=[part.name for part in fields(Parts)],
+        help="leave a part of the randomisation out, to see what it is worth",
+    )  # fmt: skip
+    parser.add_argument("--pool", type=Path, help="folder of hearts; default: pool in --out")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time")
     parser.add_argument("--export-minutes", type=float, default=5.0, help="time between exports")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network's own")
+    parser.add_argument("--workers", type=int, default=2, help="processes that fill the pool")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pool-only", action="store_true", help="fill the pool and stop")
     return parser

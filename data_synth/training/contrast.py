@@ -94,8 +94,28 @@ def draw_contrast(rng: np.random.Generator) -> Contrast:
         # In many scanners all blood looks alike, and liver like muscle: hardest to tell apart.
         mean[list(BLOOD)] = mean[Tissue.LV_CAVITY] * rng.uniform(0.92, 1.08, len(BLOOD))
         mean[Tissue.LIVER] = muscle * rng.uniform(0.8, 1.4)
-    if rng.random() < 0.06:
+    if rng.random() < 0.3:
+        # A thin wall shares its pixels with what lies on either side of it.
+        for tissue in (Tissue.RV_WALL, Tissue.ATRIAL_WALL):
+            beside = mean[Tissue.FAT if rng.random() < 0.5 else Tissue.RV_CAVITY]
+            mean[tissue] += rng.uniform(0.0, 0.9) * (beside - mean[tissue])
+    if rng.random() < 0.08:
         mean = rng.uniform(0.0, 1.4, 256).astype(np.float32)
         muscle = float(mean[Tissue.LV_MYOCARDIUM])
     texture = rng.uniform(0.005, 0.09, 256) * np.sqrt(np.maximum(mean, 0.1))
     return Contrast(mean, texture.astype(np.float32), muscle)
+
+
+def _usual_contrast() -> Contrast:
+    """One scanner's grey values: the middle of every range."""
+    mean = np.zeros(256, np.float32)
+    for tissue, (low, high) in _BRIGHTNESS.items():
+        mean[tissue] = (low + high) / 2
+    muscle = 0.35
+    mean[Tissue.LV_CAVITY] = 1.0
+    mean[[Tissue.LV_MYOCARDIUM, *WALLS, *COUNTED_AS]] = muscle
+    return Contrast(mean, np.full(256, 0.02, np.float32), muscle)
+
+
+USUAL_CONTRAST = _usual_contrast()
+"""What images have when grey values are not drawn at random."""

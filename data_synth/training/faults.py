@@ -22,6 +22,10 @@ def spoil(rng: np.random.Generator, image: Float32) -> Float32:
     sigma = rng.uniform(0.0, 1.1)
     if sigma > 0.3:
         image = np.stack([cv2.GaussianBlur(channel, (0, 0), sigma) for channel in image])
+    if rng.random() < 0.15:
+        image = _moved(rng, image)
+    if rng.random() < 0.12:
+        image = image * _bands(rng, image.shape[-1])
     if rng.random() < 0.3:
         image = _through_frequency_space(rng, image)
     image = _noisy(rng, image)
@@ -30,6 +34,11 @@ def spoil(rng: np.random.Generator, image: Float32) -> Float32:
         image = np.sign(image) * np.abs(image) ** np.float32(np.exp(rng.uniform(-0.4, 0.4)))
     gain, offset = rng.uniform(0.8, 1.25), rng.uniform(-0.08, 0.08)
     return np.asarray(image * np.float32(gain) + np.float32(offset), np.float32)
+
+
+def spoil_little(rng: np.random.Generator, image: Float32) -> Float32:
+    """Noise alone, for comparison with `spoil`."""
+    return np.stack([normalise(channel) for channel in _noisy(rng, image)])
 
 
 def normalise(image: Float32) -> Float32:
@@ -47,6 +56,22 @@ def _shading(rng: np.random.Generator, side: int) -> Float32:
     turn = rng.uniform(0.0, 2 * np.pi)
     tilt = np.cos(turn) * slope[None, :] + np.sin(turn) * slope[:, None]
     return np.asarray(np.exp(hills + tilt), np.float32)
+
+
+def _moved(rng: np.random.Generator, image: Float32) -> Float32:
+    """The average over a motion along a line, as while the frame was taken."""
+    length_px, turn = rng.uniform(1.0, 4.0), rng.uniform(0.0, np.pi)
+    line = np.zeros((9, 9), np.float32)
+    for along in np.linspace(-0.5, 0.5, 9) * length_px:
+        line[round(4 + along * np.sin(turn)), round(4 + along * np.cos(turn))] += 1 / 9
+    return np.stack([cv2.filter2D(channel, -1, line) for channel in image])
+
+
+def _bands(rng: np.random.Generator, side: int) -> Float32:
+    """Dark bands of balanced steady state, where the phase between pulses nears half a turn."""
+    slope = smooth_noise(rng, side, 3) * rng.uniform(1.0, 4.0) + rng.uniform(-np.pi, np.pi)
+    width = rng.uniform(0.1, 0.4)
+    return np.asarray(1 - np.exp(-((np.cos(slope / 2) / width) ** 2)), np.float32)
 
 
 def _through_frequency_space(rng: np.random.Generator, image: Float32) -> Float32:

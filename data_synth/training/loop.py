@@ -17,7 +17,7 @@ import torch
 
 from data_synth.training.export import write_onnx
 from data_synth.training.network import HeartNet, loss
-from data_synth.training.render import draw_sample
+from data_synth.training.render import ALL_PARTS, Parts, draw_sample
 
 Label = npt.NDArray[np.uint8]
 Report = Callable[[int, float, float], None]
@@ -27,13 +27,19 @@ Report = Callable[[int, float, float], None]
 class TrainSettings:
     """How long and how fast to learn; steps or minutes, whichever ends first."""
 
-    steps: int = 8_000
+    steps: int = 16_000
     minutes: float = math.inf
     batch: int = 8
     learning_rate: float = 2e-3
-    overlap_weight: float = 1.0
+    overlap_weight: tuple[float, float] = (1.0, 0.2)
+    """Of the Dice term at the start and at the end: it makes small structures appear early, and
+    would make the network too sure of itself late."""
+
     start: Path | None = None
     """Checkpoint to go on from; by default weights are drawn at random."""
+
+    parts: Parts = ALL_PARTS
+    """What is drawn at random in the images."""
 
     seed: int = 0
     export_minutes: float = 5.0
@@ -48,7 +54,7 @@ def draw_batches(blocks: Sequence[Label], settings: TrainSettings) -> Iterator[B
     rng = np.random.default_rng([settings.seed, 7002])
     while True:
         picks = rng.integers(len(blocks), size=settings.batch)
-        samples = [draw_sample(rng, blocks[pick]) for pick in picks]
+        samples = [draw_sample(rng, blocks[pick], settings.parts) for pick in picks]
         images = np.stack([sample.image for sample in samples])
         yield images, np.stack([sample.labels for sample in samples]).astype(np.int64)
 
@@ -97,7 +103,8 @@ def train(
         if done >= 1:
             break
         rate = _rate(done, step) * settings.learning_rate
-        value = _learn(network, optimiser, batch, rate, settings.overlap_weight)
+        first, final = settings.overlap_weight
+        value = _learn(network, optimiser, batch, rate, first + done * (final - first))
         average.update(network)
         if report is not None:
             report(step + 1, value, minutes)

@@ -7,7 +7,8 @@ step draws new images from it. A block is a stack of thin parallel planes in a f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,8 +42,8 @@ STREAM = 7001
 class PoolSettings:
     """How many hearts, how far from the mean, and the seed they come from."""
 
-    hearts: int = 180
-    blocks_per_heart: int = 4
+    hearts: int = 240
+    blocks_per_heart: int = 3
     spread: float = 1.6
     seed: int = 0
 
@@ -131,18 +132,33 @@ def heart_blocks(number: int, settings: PoolSettings) -> Label:
     return np.stack([cut_block(heart, phase % 1.0, draw_frame(rng, heart)) for phase in phases])
 
 
-def fill_pool(folder: Path, settings: PoolSettings, progress: Progress | None = None) -> list[Path]:
-    """Write the hearts that the folder lacks, one file each; return all files in order."""
+def fill_pool(
+    folder: Path, settings: PoolSettings, progress: Progress | None = None, workers: int = 1
+) -> list[Path]:
+    """Write the hearts that the folder lacks, one file each; return all files in order.
+
+    Each of ``workers`` processes draws whole hearts; their number changes no byte.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     paths = [
         folder / f"seed{settings.seed}_heart{number:04d}.npy" for number in range(settings.hearts)
     ]
-    for number, path in enumerate(paths):
-        if not path.exists():
-            part = path.with_suffix(".part")
-            with part.open("wb") as file:
-                np.save(file, heart_blocks(number, settings))
-            part.rename(path)
+    lacking = [number for number, path in enumerate(paths) if not path.exists()]
+    for number, drawn in zip(lacking, _hearts(lacking, settings, workers), strict=True):
+        part = paths[number].with_suffix(".part")
+        with part.open("wb") as file:
+            np.save(file, drawn)
+        part.rename(paths[number])
         if progress is not None:
             progress(number + 1, len(paths))
     return paths
+
+
+def _hearts(numbers: Sequence[int], settings: PoolSettings, workers: int) -> Iterator[Label]:
+    """Blocks of each heart in turn."""
+    every = [settings] * len(numbers)
+    if workers == 1:
+        yield from map(heart_blocks, numbers, every)
+    else:
+        with ProcessPoolExecutor(workers) as pool:
+            yield from pool.map(heart_blocks, numbers, every)

@@ -13,12 +13,21 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.tissue import Tissue
-from data_synth.training.contrast import IN_HEART, IS_BLOOD, LABEL_OF, Contrast, draw_contrast
-from data_synth.training.faults import smooth_noise, spoil
+from data_synth.training.contrast import (
+    IN_HEART,
+    IS_BLOOD,
+    LABEL_OF,
+    USUAL_CONTRAST,
+    Contrast,
+    draw_contrast,
+)
+from data_synth.training.faults import smooth_noise, spoil, spoil_little
 
+Float = npt.NDArray[np.floating]
 Float32 = npt.NDArray[np.float32]
 Label = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
+Places = tuple[Float, Float]
 
 CROP = 128
 """Pixels along each side of a training image."""
@@ -28,6 +37,29 @@ NEIGHBOUR = 3
 
 REACH = NEIGHBOUR + 2
 """Planes on either side of the middle one that take part in an image."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Which parts of an image are drawn at random; each can be left out to see what it is worth."""
+
+    shape: bool = True
+    """Bends, swelling, stretch, and turns of any size."""
+
+    contrast: bool = True
+    """Grey values of tissues; else those of one scanner."""
+
+    detail: bool = True
+    """Trabeculae, papillary muscles, fat, organs and vessels that the phantom lacks."""
+
+    faults: bool = True
+    """Shading, blur, motion, bands, ghosts and grey scale; else noise alone."""
+
+    neighbours: bool = True
+    """Slices that stray between breath-holds, and missing neighbours."""
+
+
+ALL_PARTS = Parts()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,71 +73,103 @@ class Sample:
     """``(3, row, column)``: a third of the way towards the apex, at the slice, towards the base."""
 
 
-def draw_sample(rng: np.random.Generator, block: Label) -> Sample:
+def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS) -> Sample:
     """Draw one image and its labels from a ``(plane, row, column)`` tissue block."""
     middle, end = _draw_plane(rng, block)
     planes = block[middle - REACH : middle + REACH + 1]
-    contrast = draw_contrast(rng)
-    slices = _thick_slices(rng, planes, contrast)
-    rows, columns = _draw_positions(rng, planes[REACH])
+    contrast = draw_contrast(rng) if parts.contrast else USUAL_CONTRAST
+    slices = _thick_slices(rng, planes, contrast, parts.detail)
+    rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
     image = np.empty((3, CROP, CROP), np.float32)
+    strays = parts.neighbours and rng.random() < 0.7
+    strayed_px = rng.uniform(0.0, 2.2) if strays else 0.0
     for channel in range(3):
         # Every slice is a breath-hold of its own: the heart does not come back to the millimetre.
-        shift = rng.normal(0.0, 1.2, 2) if channel != 1 and rng.random() < 0.6 else (0.0, 0.0)
+        shift = rng.normal(0.0, strayed_px, 2) if channel != 1 else (0.0, 0.0)
         image[channel] = cv2.remap(
             slices[channel],
             columns + np.float32(shift[0]),
             rows + np.float32(shift[1]),
             cv2.INTER_LINEAR,
         )
-    _drop_neighbours(rng, image, end)
+    if parts.neighbours:
+        _drop_neighbours(rng, image, end)
     labels = LABEL_OF[planes[REACH - 1 : REACH + 2]]
     carried = [cv2.remap(one, columns, rows, cv2.INTER_NEAREST) for one in labels]
-    return Sample(spoil(rng, image), np.stack(carried))
+    spoiled = spoil(rng, image) if parts.faults else spoil_little(rng, image)
+    return Sample(spoiled, np.stack(carried))
 
 
 def _draw_plane(rng: np.random.Generator, block: Label) -> tuple[int, int]:
-    """A plane that cuts the heart, often at its tip (-1) or roof (+1); now and then any plane (0).
+    """A plane, and whether it may be the first (-1) or last (+1) of its stack.
 
-    Every stack has a slice on either side of tip and roof, which are rare among all planes.
+    Mostly planes through the ventricles. Those about the tip, the valves and the roof are rare
+    among all planes and the hardest, and many stacks end there.
     """
     first, last = REACH, len(block) - REACH - 1
-    cut = LABEL_OF[block[first : last + 1, ::8, ::8]].any(axis=(1, 2))
+    labels = LABEL_OF[block[first : last + 1, ::8, ::8]]
+    cut = labels.any(axis=(1, 2))
+    ventricles = ((labels > 0) & (labels <= LABEL_OF[Tissue.RV_CAVITY])).any(axis=(1, 2))
     chance = rng.random()
-    if not cut.any() or chance < 0.1:
+    if not cut.any() or chance < 0.08:
         return int(rng.integers(first, last + 1)), 0
-    planes = first + np.flatnonzero(cut)
-    if chance < 0.65:
+    planes = first + np.flatnonzero(ventricles if ventricles.any() and chance < 0.78 else cut)
+    if chance < 0.4 or chance >= 0.9:
         return int(rng.choice(planes)), 0
-    end = -1 if chance < 0.88 else 1
-    tip = planes[0] if end < 0 else planes[-1]
+    end = -1 if chance < 0.6 else 1
+    outermost = planes[0] if end < 0 else planes[-1]
     away = rng.integers(-NEIGHBOUR - 1, NEIGHBOUR + 1) * end
-    return int(np.clip(tip + away, first, last)), end
+    return int(np.clip(outermost + away, first, last)), end
 
 
-def _draw_positions(rng: np.random.Generator, plane: Label) -> tuple[Float32, Float32]:
+def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Places:
     """Where in the plane each pixel of the image lies: row and column, ``(CROP, CROP)``."""
     heart = np.argwhere(LABEL_OF[plane[::4, ::4]]) * 4.0
     near = len(heart) > 0 and rng.random() < 0.9
     centre = heart.mean(axis=0) if near else np.array(plane.shape) / 2
     centre = centre + rng.normal(0.0, 14.0 if near else 30.0, 2)
-    turn = rng.normal(0.0, 0.4) if rng.random() < 0.9 else rng.uniform(-np.pi, np.pi)
-    size, stretch = np.exp(rng.normal(0.0, 0.1)), np.exp(rng.normal(0.0, 0.05))
     axis = np.arange(CROP) - (CROP - 1) / 2
+    if not shape:
+        rows, columns = np.meshgrid(centre[0] + axis, centre[1] + axis, indexing="ij")
+        return rows.astype(np.float32), columns.astype(np.float32)
+    turn = rng.normal(0.0, 0.5) if rng.random() < 0.88 else rng.uniform(-np.pi, np.pi)
+    size, stretch = np.exp(rng.normal(0.0, 0.12)), np.exp(rng.normal(0.0, 0.07))
     across = axis[None, :] * size * stretch
     down = axis[:, None] * size / stretch
-    if rng.random() < 0.7:
+    if rng.random() < 0.8:
         knots = int(rng.integers(3, 8))
         # Bends grow with their length, so that no fold can arise.
-        strength = rng.uniform(0.3, 3.0) * 4 / knots
+        strength = rng.uniform(0.3, 3.5) * 4 / knots
         across = across + strength * smooth_noise(rng, CROP, knots)
         down = down + strength * smooth_noise(rng, CROP, knots)
     columns = centre[1] + np.cos(turn) * across - np.sin(turn) * down
     rows = centre[0] + np.sin(turn) * across + np.cos(turn) * down
+    if rng.random() < 0.6:
+        rows, columns = _swollen(rng, plane, rows, columns)
     return rows.astype(np.float32), columns.astype(np.float32)
 
 
-def _thick_slices(rng: np.random.Generator, planes: Label, contrast: Contrast) -> Float32:
+def _swollen(rng: np.random.Generator, plane: Label, rows: Float, columns: Float) -> Places:
+    """Positions that make the left ventricle's cavity wider or narrower than its wall's outside.
+
+    A radial scaling that fades out: r (1 + a exp(-(r / reach)^2)) rises everywhere while
+    -1 < a < 2.2, so nothing folds.
+    """
+    cavity = np.argwhere(plane[::2, ::2] == Tissue.LV_CAVITY) * 2.0
+    if not len(cavity):
+        return rows, columns
+    radius = np.sqrt(4 * len(cavity) / np.pi)
+    middle = cavity.mean(axis=0) + rng.normal(0.0, 0.15 * radius, 2)
+    away_rows, away_columns = rows - middle[0], columns - middle[1]
+    reach = max(radius, 4.0) * rng.uniform(0.7, 2.0)
+    square = (away_rows**2 + away_columns**2) / reach**2
+    factor = np.clip(rng.normal(0.0, 0.18), -0.35, 0.5) * np.exp(-square)
+    return rows + factor * away_rows, columns + factor * away_columns
+
+
+def _thick_slices(
+    rng: np.random.Generator, planes: Label, contrast: Contrast, detail: bool
+) -> Float32:
     """Images of the three slices, each the average over its thickness."""
     side = planes.shape[-1]
     half = NEIGHBOUR * rng.uniform(0.5, 1.05) / 2
@@ -115,7 +179,7 @@ def _thick_slices(rng: np.random.Generator, planes: Label, contrast: Contrast) -
     weights = (weights / weights.sum()).astype(np.float32)
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
-    decor = _Decor(rng, side)
+    decor = _Decor(rng, side) if detail else None
     mean = contrast.mean.copy()
     if rng.random() < 0.5:
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
@@ -128,7 +192,8 @@ def _thick_slices(rng: np.random.Generator, planes: Label, contrast: Contrast) -
         signed = np.tensordot(weights, mean[near], 1)
         images[channel] = np.abs(cv2.GaussianBlur(signed, (0, 0), border_px))
         images[channel] += contrast.texture[near[2]] * grain
-        decor.paint(images[channel], near[2], contrast)
+        if decor is not None:
+            decor.paint(images[channel], near[2], contrast)
     return np.maximum(images, 0)
 
 
@@ -154,14 +219,16 @@ class _Decor:
         self.organ = rng.uniform(0.0, 1.4, 3)
         self.organ_level = rng.uniform(0.5, 2.5, 3)
         self.organs = int(rng.integers(0, 4))
-        self.fat_mm = rng.uniform(-6.0, 8.0)
-        self.fat = rng.uniform(0.3, 1.6)
-        self.trabecula_px = rng.uniform(0.5, 6.0) if rng.random() < 0.7 else 0.0
-        self.trabecula_level = rng.uniform(-0.5, 1.2)
-        self.trabecula = rng.uniform(0.2, 1.0)
-        self.papillary = rng.uniform(0.0, 2 * np.pi, 2) if rng.random() < 0.6 else np.empty(0)
-        self.papillary_depth = rng.uniform(0.35, 0.75)
-        self.papillary_size = rng.uniform(0.1, 0.28)
+        self.fat_px = rng.uniform(-6.0, 8.0)
+        # Mostly fat; an effusion, an organ or lung may lie against the heart as well.
+        self.fat = rng.uniform(0.3, 1.6) if rng.random() < 0.75 else rng.uniform(0.0, 1.2)
+        self.tubes = rng.uniform(0.0, 1.0, (int(rng.integers(0, 5)), 5))
+        self.strands = {
+            Tissue.LV_CAVITY: _Strands.draw(rng, 6.0),
+            Tissue.RV_CAVITY: _Strands.draw(rng, 12.0),
+        }
+        self.papillaries = _draw_papillaries(rng)
+        self.edge_px = rng.uniform(0.4, 1.0)
         self.flow = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else 0.0
 
     def paint(self, image: Float32, tissue: Label, contrast: Contrast) -> None:
@@ -171,32 +238,80 @@ class _Decor:
         for number in range(self.organs):
             blob = outside & (self.coarse[number] > self.organ_level[number])
             image[blob] = 0.3 * image[blob] + 0.7 * self.organ[number]
-        if self.fat_mm > 0 and inside.any():
+        if self.fat_px > 0 and inside.any():
             away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
-            image[outside & (away < self.fat_mm + 3 * self.coarse[0])] = self.fat
+            image[outside & (away < self.fat_px + 3 * self.coarse[0])] = self.fat
+        self._add_tubes(image, outside, contrast)
         blood = IS_BLOOD[tissue]
         image[blood] *= (1 + self.flow * self.coarse[1])[blood]
-        for cavity in (Tissue.LV_CAVITY, Tissue.RV_CAVITY):
-            self._trabeculate(image, tissue == cavity, contrast.muscle)
-        self._add_papillaries(image, tissue == Tissue.LV_CAVITY, contrast.muscle)
+        muscle = np.zeros_like(image)
+        for chamber, strands in self.strands.items():
+            strands.paint(muscle, tissue == chamber, self.fine, self.coarse[2])
+        _paint_papillaries(muscle, tissue == Tissue.LV_CAVITY, self.papillaries)
+        if muscle.any():
+            muscle = cv2.GaussianBlur(muscle, (0, 0), self.edge_px)
+            image += np.where(blood, muscle, 0) * (contrast.muscle - image)
 
-    def _trabeculate(self, image: Float32, cavity: Mask, muscle: float) -> None:
-        if self.trabecula_px == 0 or not cavity.any():
+    def _add_tubes(self, image: Float32, outside: Mask, contrast: Contrast) -> None:
+        """Bright ovals with a dark rim: vessels and bowels that belong to no structure."""
+        side = image.shape[0]
+        for row, column, size, shape, grey in self.tubes:
+            centre = (column * side, row * side)
+            axes = ((2 + 12 * size) * 2, (2 + 12 * size) * (0.8 + shape))
+            for grown, value in ((3.0, contrast.muscle * 0.8), (0.0, 0.5 + 0.7 * grey)):
+                oval = np.zeros(image.shape, np.uint8)
+                box = (centre, (axes[0] + grown, axes[1] + grown), 180 * grey)
+                cv2.ellipse(oval, box, 1, cv2.FILLED)
+                image[(oval > 0) & outside] = value
+
+
+@dataclass(frozen=True, slots=True)
+class _Strands:
+    """Trabeculae along a chamber's wall."""
+
+    depth_px: float
+    """How far they reach into the cavity; 0 where there are none."""
+
+    level: float
+    """Of a smooth noise of unit variance, above which muscle stands; rises with depth."""
+
+    share: float
+    """Of muscle in a pixel."""
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, deepest_px: float) -> _Strands:
+        """Draw them for one chamber; three in four have some, a few are nearly filled."""
+        depth_px = rng.uniform(0.5, deepest_px) if rng.random() < 0.75 else 0.0
+        if rng.random() < 0.05:
+            depth_px = 2 * deepest_px
+        return cls(depth_px, rng.uniform(-0.7, 1.2), rng.uniform(0.2, 1.0))
+
+    def paint(self, muscle: Float32, cavity: Mask, fine: Float32, coarse: Float32) -> None:
+        """Raise the share of muscle in place where strands stand in ``cavity``."""
+        if self.depth_px == 0 or not cavity.any():
             return
         depth = cv2.distanceTransform(cavity.astype(np.uint8), cv2.DIST_L2, 3)
-        depth_limit = min(self.trabecula_px, 0.5 * float(depth.max()))
-        strands = cavity & (depth < depth_limit) & (self.fine > self.trabecula_level)
-        image[strands] += self.trabecula * (muscle - image[strands])
+        limit = min(self.depth_px, 0.6 * float(depth.max())) * (1 + 0.5 * coarse)
+        above = self.level + 0.5 * (depth / np.maximum(limit, 0.3) - 0.5)
+        muscle[cavity & (depth < limit) & (fine > above)] = self.share
 
-    def _add_papillaries(self, image: Float32, cavity: Mask, muscle: float) -> None:
-        if not len(self.papillary) or not cavity.any():
-            return
-        where = np.argwhere(cavity)
-        centre, radius = where.mean(axis=0), np.sqrt(len(where) / np.pi)
-        rows, columns = np.ogrid[: cavity.shape[0], : cavity.shape[1]]
-        for angle in self.papillary:
-            row, column = centre + self.papillary_depth * radius * np.array(
-                [np.sin(angle), np.cos(angle)]
-            )
-            near = np.hypot(rows - row, columns - column) < self.papillary_size * radius
-            image[near & cavity] = muscle
+
+def _draw_papillaries(rng: np.random.Generator) -> Float:
+    """Papillary muscles ``(n, 5)``: angle, depth, length, width (shares of radius), turn."""
+    count = int(rng.integers(1, 5)) if rng.random() < 0.65 else 0
+    low, high = (0.0, 0.35, 0.12, 0.06, -0.6), (2 * np.pi, 1.0, 0.4, 0.26, 0.6)
+    return rng.uniform(low, high, (count, 5))
+
+
+def _paint_papillaries(muscle: Float32, cavity: Mask, papillaries: Float) -> None:
+    """Fill ovals that point to the middle of the cavity with muscle, in place."""
+    if not len(papillaries) or not cavity.any():
+        return
+    where = np.argwhere(cavity)
+    centre, radius = where.mean(axis=0), np.sqrt(len(where) / np.pi)
+    for angle, depth, length, width, turn in papillaries:
+        row, column = centre + depth * radius * np.array([np.sin(angle), np.cos(angle)])
+        oval = np.zeros(muscle.shape, np.uint8)
+        box = ((column, row), (2 * length * radius, 2 * width * radius), np.degrees(angle + turn))
+        cv2.ellipse(oval, box, 1, cv2.FILLED)
+        muscle[(oval > 0) & cavity] = 1.0
