@@ -56,8 +56,10 @@ bench: setup ## speed beside peers, as ratios in one run
 
 train: setup ## make the segmentation weights anew from the phantom (an hour and a half; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(BIN)/python -m data_synth.training --out training
-	cp training/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(BIN)/python -m data_synth.training --out training --without rims
+	$(BIN)/python -m data_synth.training --out training/fine --pool training/pool \
+		--start training/heart.pt --learning-rate 8e-4 --steps 4000
+	cp training/fine/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
 	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)

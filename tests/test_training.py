@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch", reason="training needs the extra 'train'")
 pytest.importorskip("onnx", reason="training needs the extra 'train'")
 
 from data_synth.population import draw_heart  # noqa: E402
-from data_synth.tissue import COUNTED_AS, TRUTH_LABELS  # noqa: E402
+from data_synth.tissue import COUNTED_AS, TRUTH_LABELS, Tissue  # noqa: E402
 from data_synth.training.__main__ import main  # noqa: E402
 from data_synth.training.contrast import CLASSES, LABEL_OF, draw_contrast  # noqa: E402
 from data_synth.training.export import write_onnx  # noqa: E402
@@ -26,7 +26,13 @@ from data_synth.training.pool import (  # noqa: E402
     fill_pool,
     heart_blocks,
 )
-from data_synth.training.render import CROP, draw_sample  # noqa: E402
+from data_synth.training.render import (  # noqa: E402
+    CROP,
+    Parts,
+    _draw_positions,
+    draw_sample,
+    thin_walled,
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +75,59 @@ def test_sample_is_a_normal_image_with_labels_on_three_planes(blocks):
         assert sample.image.dtype == np.float32
         assert np.isfinite(sample.image).all()
         assert sample.labels.max() < CLASSES
+
+
+def test_bent_and_swollen_images_never_fold():
+    rows, columns = np.mgrid[:176, :176]
+    away = np.hypot(rows - 88, columns - 90)
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        radius = rng.uniform(4, 28)
+        plane = np.where(away < radius + 6, Tissue.LV_MYOCARDIUM, Tissue.AIR)
+        plane = np.where(away < radius, Tissue.LV_CAVITY, plane).astype(np.uint8)
+        down, across = _draw_positions(rng, plane, shape=True)
+        area = np.diff(down, axis=0)[:, :-1] * np.diff(across, axis=1)[:-1]
+        area -= np.diff(down, axis=1)[:-1] * np.diff(across, axis=0)[:, :-1]
+        # One sense of rotation everywhere: the map from image to plane has no fold.
+        assert area.min() > 0
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_thin_wall_loses_its_outer_layers_to_what_lies_there(layers):
+    rows, columns = np.mgrid[:64, :64]
+    away = np.hypot(rows - 32, columns - 32)
+    plane = np.where(columns < 32, Tissue.FAT, Tissue.LUNG)
+    plane = np.where(away < 20, Tissue.LV_MYOCARDIUM, plane)
+    plane = np.where(away < 14, Tissue.LV_CAVITY, plane).astype(np.uint8)
+    found = thin_walled(plane[None], layers)[0]
+    assert ((found == Tissue.LV_CAVITY) == (plane == Tissue.LV_CAVITY)).all()
+    muscle = found == Tissue.LV_MYOCARDIUM
+    # Layers are taken along rows and columns: there the wall is thinner by just that many pixels.
+    assert muscle[32, 32:].sum() == (plane[32, 32:] == Tissue.LV_MYOCARDIUM).sum() - layers
+    assert set(np.unique(found[(plane == Tissue.LV_MYOCARDIUM) & ~muscle])) == {
+        Tissue.FAT,
+        Tissue.LUNG,
+    }
+    # However many layers go, the cavity never meets the outside.
+    bare = thin_walled(plane[None], 9)[0]
+    ring = cv2.dilate((plane == Tissue.LV_CAVITY).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert np.isin(bare[ring], (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM)).all()
+
+
+def test_without_random_parts_an_image_is_its_plane_in_one_scanners_grey_values(blocks):
+    plain = Parts(
+        shape=False, contrast=False, detail=False, faults=False, neighbours=False, rims=False
+    )
+    rng = np.random.default_rng(5)
+    inside, muscle = [], []
+    for k in range(12):
+        sample = draw_sample(rng, blocks[k % 2], plain)
+        inside.append(sample.image[1][sample.labels[1] == 1])
+        muscle.append(sample.image[1][sample.labels[1] == 2])
+    blood, dark = np.concatenate(inside), np.concatenate(muscle)
+    # Blood is drawn at 1 and muscle at 0.35 of it; noise, partial volume and scaling come after.
+    assert np.median(dark) < 0.6 * np.median(blood)
+    assert np.std(blood) < 0.25 * np.median(blood)
 
 
 def test_samples_show_all_structures_and_no_two_are_alike(blocks):

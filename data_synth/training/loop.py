@@ -33,7 +33,8 @@ class TrainSettings:
     learning_rate: float = 2e-3
     overlap_weight: tuple[float, float] = (1.0, 0.2)
     """Of the Dice term at the start and at the end: it makes small structures appear early, and
-    would make the network too sure of itself late."""
+    would make the network too sure of itself late. A run that goes on from a checkpoint has the
+    second all along."""
 
     start: Path | None = None
     """Checkpoint to go on from; by default weights are drawn at random."""
@@ -104,6 +105,7 @@ def train(
             break
         rate = _rate(done, step) * settings.learning_rate
         first, final = settings.overlap_weight
+        first = final if settings.start else first
         value = _learn(network, optimiser, batch, rate, first + done * (final - first))
         average.update(network)
         if report is not None:

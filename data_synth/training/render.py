@@ -58,8 +58,14 @@ class Parts:
     neighbours: bool = True
     """Slices that stray between breath-holds, and missing neighbours."""
 
+    rims: bool = True
+    """Thin walls, dark rims around the heart, and planes that barely cut a ventricle: what is
+    easily mistaken, shown more often than it occurs."""
+
 
 ALL_PARTS = Parts()
+
+_WITHIN_MUSCLE = (Tissue.LV_CAVITY, Tissue.PAPILLARY_MUSCLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +82,13 @@ class Sample:
 def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS) -> Sample:
     """Draw one image and its labels from a ``(plane, row, column)`` tissue block."""
     middle, end = _draw_plane(rng, block)
+    if parts.rims and rng.random() < 0.25:
+        middle, end = _draw_grazing_plane(rng, block), 0
     planes = block[middle - REACH : middle + REACH + 1]
+    if parts.rims and rng.random() < 0.4:
+        planes = thin_walled(planes, int(rng.integers(1, 4)))
     contrast = draw_contrast(rng) if parts.contrast else USUAL_CONTRAST
-    slices = _thick_slices(rng, planes, contrast, parts.detail)
+    slices = _thick_slices(rng, planes, contrast, parts)
     rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
     image = np.empty((3, CROP, CROP), np.float32)
     strays = parts.neighbours and rng.random() < 0.7
@@ -120,6 +130,48 @@ def _draw_plane(rng: np.random.Generator, block: Label) -> tuple[int, int]:
     outermost = planes[0] if end < 0 else planes[-1]
     away = rng.integers(-NEIGHBOUR - 1, NEIGHBOUR + 1) * end
     return int(np.clip(outermost + away, first, last)), end
+
+
+def _draw_grazing_plane(rng: np.random.Generator, block: Label) -> int:
+    """A plane that cuts little of the left ventricle's muscle or of the right ventricle."""
+    first, last = REACH, len(block) - REACH - 1
+    labels = LABEL_OF[block[first : last + 1, ::4, ::4]]
+    tissue = Tissue.LV_MYOCARDIUM if rng.random() < 0.6 else Tissue.RV_CAVITY
+    area = (labels == LABEL_OF[tissue]).sum(axis=(1, 2))
+    little = first + np.flatnonzero((area > 0) & (area < 0.25 * area.max()))
+    return int(rng.choice(little) if len(little) else rng.integers(first, last + 1))
+
+
+def thin_walled(planes: Label, layers: int) -> Label:
+    """The same heart with its left ventricle's muscle thinner by some pixels on the outside.
+
+    What lies against the muscle takes the place of its outer layers, but two pixels of muscle
+    stay around the cavity.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue.
+    layers
+        Pixels taken away along rows and columns.
+    """
+    found = np.argwhere((planes == Tissue.LV_MYOCARDIUM).any(axis=0))
+    if not len(found):
+        return planes
+    (top, left), (bottom, right) = np.maximum(found.min(axis=0) - 1, 0), found.max(axis=0) + 2
+    thinner = planes.copy()
+    for plane in thinner:
+        part = plane[top:bottom, left:right]
+        cavity = np.isin(part, _WITHIN_MUSCLE).astype(np.uint8)
+        free = (part == Tissue.LV_MYOCARDIUM) & (cv2.dilate(cavity, np.ones((5, 5), np.uint8)) == 0)
+        for _ in range(layers):
+            beside = part.copy()
+            for step, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
+                shifted = np.roll(beside, step, axis)
+                outer = free & (part == Tissue.LV_MYOCARDIUM)
+                outer &= ~np.isin(shifted, (*_WITHIN_MUSCLE, Tissue.LV_MYOCARDIUM, Tissue.SCAR))
+                part[outer] = shifted[outer]
+    return thinner
 
 
 def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Places:
@@ -168,7 +220,7 @@ def _swollen(rng: np.random.Generator, plane: Label, rows: Float, columns: Float
 
 
 def _thick_slices(
-    rng: np.random.Generator, planes: Label, contrast: Contrast, detail: bool
+    rng: np.random.Generator, planes: Label, contrast: Contrast, parts: Parts
 ) -> Float32:
     """Images of the three slices, each the average over its thickness."""
     side = planes.shape[-1]
@@ -179,7 +231,7 @@ def _thick_slices(
     weights = (weights / weights.sum()).astype(np.float32)
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
-    decor = _Decor(rng, side) if detail else None
+    decor = _Decor(rng, side, parts.rims) if parts.detail else None
     mean = contrast.mean.copy()
     if rng.random() < 0.5:
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
@@ -213,7 +265,7 @@ class _Decor:
     smooth one that a reader draws.
     """
 
-    def __init__(self, rng: np.random.Generator, side: int) -> None:
+    def __init__(self, rng: np.random.Generator, side: int, rims: bool) -> None:
         self.fine = smooth_noise(rng, side, side // int(rng.integers(3, 9)))
         self.coarse = [smooth_noise(rng, side, int(rng.integers(4, 20))) for _ in range(3)]
         self.organ = rng.uniform(0.0, 1.4, 3)
@@ -230,6 +282,8 @@ class _Decor:
         self.papillaries = _draw_papillaries(rng)
         self.edge_px = rng.uniform(0.4, 1.0)
         self.flow = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else 0.0
+        self.rims = rng.uniform(0.0, 0.5, 2) * (rng.random(2) < 0.5) if rims else np.zeros(2)
+        self.rim_px = rng.uniform(0.8, 1.6, 2) if rims else np.ones(2)
 
     def paint(self, image: Float32, tissue: Label, contrast: Contrast) -> None:
         """Add the detail to one slice in place; ``tissue`` is that of its middle plane."""
@@ -240,7 +294,12 @@ class _Decor:
             image[blob] = 0.3 * image[blob] + 0.7 * self.organ[number]
         if self.fat_px > 0 and inside.any():
             away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
-            image[outside & (away < self.fat_px + 3 * self.coarse[0])] = self.fat
+            reach_px = self.fat_px + 3 * self.coarse[0]
+            image[outside & (away < reach_px)] = self.fat
+            # The pericardium around the fat, and the black line where fat meets muscle.
+            around = (away >= reach_px, away < reach_px + self.rim_px[0])
+            self._darken(image, outside & around[0] & around[1], self.rims[0])
+            self._darken(image, outside & (away < self.rim_px[1]), self.rims[1])
         self._add_tubes(image, outside, contrast)
         blood = IS_BLOOD[tissue]
         image[blood] *= (1 + self.flow * self.coarse[1])[blood]
@@ -251,6 +310,10 @@ class _Decor:
         if muscle.any():
             muscle = cv2.GaussianBlur(muscle, (0, 0), self.edge_px)
             image += np.where(blood, muscle, 0) * (contrast.muscle - image)
+
+    def _darken(self, image: Float32, where: Mask, grey: float) -> None:
+        if grey > 0:
+            image[where] = np.minimum(image[where], grey)
 
     def _add_tubes(self, image: Float32, outside: Mask, contrast: Contrast) -> None:
         """Bright ovals with a dark rim: vessels and bowels that belong to no structure."""
