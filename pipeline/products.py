@@ -14,13 +14,17 @@ import numpy.typing as npt
 
 from pipeline.geometry import Float, Label, MovingSurface, Surface
 from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
 
 
-def write_cine(folder: Path, stack: Stack) -> None:
-    """``cine.nii.gz`` and ``phases.json``."""
+def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> None:
+    """``cine.nii.gz``, ``phases.json`` and ``long_axis_<k>.nii.gz``, one a view."""
     cine = stack.cine
+    for number, view in enumerate(views):
+        path = folder / f"long_axis_{number}.nii.gz"
+        write_image(path, _compact(view.cine.intensity), view.cine.mr_from_index)
     write_image(folder / "cine.nii.gz", _compact(cine.intensity), cine.mr_from_index)
     write_table(
         folder / "phases.json",
@@ -31,6 +35,11 @@ def write_cine(folder: Path, stack: Stack) -> None:
             "rr_ms": stack.rr_ms.tolist(),
             "timing_source": stack.timing_source,
             "left_out": list(stack.left_out),
+            "interpolated_slices": list(cine.interpolated),
+            "long_axis": [
+                {"name": view.name, "phases": view.cine.phases.tolist(), "rr_s": view.cine.rr_s}
+                for view in views
+            ],
         },
     )
 
@@ -44,7 +53,19 @@ def read_cine(folder: Path) -> Cine:
         mr_from_index,
         np.array(timing["phases"]),
         float(timing["rr_s"]),
+        tuple(timing.get("interpolated_slices", ())),
     )
+
+
+def read_long_axis(folder: Path) -> tuple[LongAxis, ...]:
+    """The long-axis views that ``write_cine`` wrote; none where there were none."""
+    views = []
+    for number, entry in enumerate(read_table(folder / "phases.json").get("long_axis", [])):
+        intensity, mr_from_index = read_image(folder / f"long_axis_{number}.nii.gz")
+        pixels = np.ascontiguousarray(intensity, np.float32)
+        cine = Cine(pixels, mr_from_index, np.array(entry["phases"]), float(entry["rr_s"]))
+        views.append(LongAxis(entry["name"], cine))
+    return tuple(views)
 
 
 def _compact(intensity: npt.NDArray[np.float32]) -> npt.NDArray[Any]:

@@ -29,6 +29,9 @@ class CineFiles(_Section):
     rr_ms: float | None = Field(None, gt=0)
     """Overrides the files' own RR interval."""
 
+    fill_gaps: bool = False
+    """Let the mean of both neighbours stand in for a slice that is missing from DICOM files."""
+
 
 class EcgFiles(_Section):
     """ECG records during MR and during ultrasound; WFDB records are named by their stem."""
@@ -54,6 +57,11 @@ class Study(_Section):
     us: UltrasoundFiles | None = None
 
     @property
+    def long_axis(self) -> Path:
+        """Where long-axis views lie beside a cine in NIfTI, if there are any."""
+        return self.folder / "long_axis"
+
+    @property
     def truth(self) -> Path | None:
         """The folder of known answers, where the study is synthetic."""
         truth = self.folder / "truth"
@@ -63,6 +71,8 @@ class Study(_Section):
         """Every file that a stage may read, by kind: cine, mr_ecg, us, truth."""
         us = _record_files(self.ecg.us) + (list(self.us.sweeps) if self.us else [])
         cine = _files(self.cine.path) + ([self.cine.timing] if self.cine.timing else [])
+        if self.long_axis.is_dir() and not self.cine.path.is_dir():
+            cine += _files(self.long_axis)
         return {
             "cine": cine,
             "mr_ecg": _record_files(self.ecg.mr),

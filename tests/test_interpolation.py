@@ -37,10 +37,10 @@ def stack_of(inside):
     return np.stack([1 - inside, inside], axis=1)[None].astype(np.float32)
 
 
-def volume_of(probability, plane_mm, shifts_mm=None, gap_mm=10.0, grid_mm=PIXEL_MM):
+def volume_of(probability, plane_mm, shifts_mm=None, reach_mm=10.0, grid_mm=PIXEL_MM):
     shifts_mm = np.zeros((len(plane_mm), 2)) if shifts_mm is None else shifts_mm
     volume, first_mm = isotropic_labels(
-        probability, PIXEL_MM, plane_mm, shifts_mm, gap_mm, grid_mm, 6.0
+        probability, PIXEL_MM, plane_mm, shifts_mm, reach_mm, grid_mm, 6.0
     )
     heights_mm = first_mm[2] + grid_mm * np.arange(volume.shape[1])
     return volume[0], heights_mm, first_mm
@@ -185,7 +185,7 @@ def test_what_grows_towards_the_end_stops_before_the_next_slice():
     x, y = in_plane_mm()
     depth_mm = (15 + 0.2 * plane_mm)[:, None, None] - np.hypot(x, y)
 
-    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm, gap_mm=10.0)
+    volume, height_mm, _ = volume_of(stack_of(soft(depth_mm)), plane_mm, reach_mm=10.0)
 
     present_mm = height_mm[volume.any(axis=(1, 2))]
     assert plane_mm[-1] < present_mm.max() < plane_mm[-1] + 10
@@ -235,8 +235,8 @@ def test_breath_hold_jumps_are_found_and_tilt_is_left_alone():
     rng = np.random.default_rng(5)
     shifts_mm = rng.normal(0, (0.5, 2.0), (10, 2))
 
-    found_mm = slice_shifts_mm(tilted_heart(shifts_mm), PIXEL_MM, 10.0, axes)
-    still_mm = slice_shifts_mm(tilted_heart(0 * shifts_mm), PIXEL_MM, 10.0, axes)
+    found_mm = slice_shifts_mm(tilted_heart(shifts_mm), PIXEL_MM, 10.0 * np.arange(10), axes)
+    still_mm = slice_shifts_mm(tilted_heart(0 * shifts_mm), PIXEL_MM, 10.0 * np.arange(10), axes)
 
     left_mm = without_trend(found_mm - shifts_mm)
     # The part that carries no curvature cannot be seen; of the rest at least half must go.

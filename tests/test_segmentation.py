@@ -22,7 +22,7 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_probability
 from pipeline.imaging.inference import blend_phases
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.network import WEIGHTS, neighbour_steps, normalise, with_neighbours
+from pipeline.imaging.network import WEIGHTS, neighbour_steps, neighbours, normalise
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
 
@@ -30,6 +30,8 @@ SEED = 424_242
 """Of the phantom studied here; training hearts come from a stream of their own."""
 
 PHASES = 3
+
+QUICK = SegmentSettings(most_views=1)
 
 
 def phantom(mr, seed=SEED):
@@ -46,7 +48,7 @@ def phantom(mr, seed=SEED):
 def study():
     mr = MrSettings(phases=PHASES, matrix=160, pixel_mm=1.7, through_plane_samples=4)
     heart, cine, truth = phantom(mr)
-    return heart, cine, truth, segment_cine(cine, SegmentSettings())
+    return heart, cine, truth, segment_cine(cine, QUICK)
 
 
 def dice(found, truth):
@@ -158,7 +160,7 @@ def test_storage_order_of_the_images_does_not_matter(study):
     swap = np.eye(4)[[1, 0, 2, 3]]
     other = replace(cine, intensity=stored, mr_from_index=cine.mr_from_index @ flip @ swap)
 
-    again = segment_cine(other, SegmentSettings())
+    again = segment_cine(other, QUICK)
 
     back = again.labels.transpose(0, 1, 3, 2)[:, ::-1, :, ::-1]
     # Resampling rounds differently; only pixels on an outline may change.
@@ -169,7 +171,7 @@ def test_storage_order_of_the_images_does_not_matter(study):
 def test_same_images_give_the_same_bytes_and_units_do_not_matter(study):
     _, cine, _, found = study
     louder = replace(cine, intensity=cine.intensity * np.float32(2))
-    again = segment_cine(louder, SegmentSettings())
+    again = segment_cine(louder, QUICK)
     assert again.heart.tobytes() == found.heart.tobytes()
     assert again.labels.tobytes() == found.labels.tobytes()
 
@@ -179,7 +181,7 @@ def test_thin_contiguous_slices_are_understood():
     mr = MrSettings(phases=2, matrix=112, pixel_mm=2.4, slice_thickness_mm=3.0, slice_gap_mm=0.0,
                     through_plane_samples=1, breath_hold_shift_mm=0.0)  # fmt: skip
     heart, cine, truth = phantom(mr)
-    found = segment_cine(cine, SegmentSettings())
+    found = segment_cine(cine, QUICK)
     for name, (value, _) in TRUTH_LABELS.items():
         if name != "aorta":
             assert dice(found.labels == value, truth == value) > 0.75
@@ -189,7 +191,7 @@ def test_thin_contiguous_slices_are_understood():
 
 def test_progress_counts_the_phases(study):
     told = []
-    segment_cine(study[1], SegmentSettings(), lambda *done: told.append(done))
+    segment_cine(study[1], QUICK, lambda *done: told.append(done))
     assert told == [(k + 1, PHASES) for k in range(PHASES)]
 
 
@@ -197,13 +199,13 @@ def test_noise_is_refused_as_no_heart(study):
     cine = study[1]
     noise = np.random.default_rng(0).rayleigh(100.0, cine.intensity.shape).astype(np.float32)
     with pytest.raises(StageError, match=r"slice.*phase|phase.*slice"):
-        segment_cine(replace(cine, intensity=noise), SegmentSettings())
+        segment_cine(replace(cine, intensity=noise), QUICK)
 
 
 def test_empty_images_are_refused_as_no_heart(study):
     cine = study[1]
     with pytest.raises(StageError, match="no heart found"):
-        segment_cine(replace(cine, intensity=np.zeros_like(cine.intensity)), SegmentSettings())
+        segment_cine(replace(cine, intensity=np.zeros_like(cine.intensity)), QUICK)
 
 
 def test_a_single_spoilt_image_is_named(study):
@@ -211,21 +213,21 @@ def test_a_single_spoilt_image_is_named(study):
     images = cine.intensity.copy()
     images[1, 6] = np.random.default_rng(0).rayleigh(100.0, images[1, 6].shape)
     with pytest.raises(StageError, match=r"phase 1, slice 6:"):
-        segment_cine(replace(cine, intensity=images), SegmentSettings())
+        segment_cine(replace(cine, intensity=images), QUICK)
 
 
 def test_doubt_and_a_missing_ventricle_are_named_with_the_setting_to_change(study):
     with pytest.raises(StageError, match=r"phase \d, slice \d+: .*min_confidence"):
-        segment_cine(study[1], SegmentSettings(min_confidence=1.0))
+        segment_cine(study[1], SegmentSettings(most_views=1, min_confidence=1.0))
     with pytest.raises(StageError, match=r"phase \d.*min_ventricle_ml"):
-        segment_cine(study[1], SegmentSettings(min_ventricle_ml=2000.0))
+        segment_cine(study[1], SegmentSettings(most_views=1, min_ventricle_ml=2000.0))
 
 
 def test_numbers_that_are_none_are_named(study):
     images = study[1].intensity.copy()
     images[2, 4, 7, 7] = np.nan
     with pytest.raises(InputError, match="phase 2, slice 4"):
-        segment_cine(replace(study[1], intensity=images), SegmentSettings())
+        segment_cine(replace(study[1], intensity=images), QUICK)
 
 
 def test_missing_weights_are_named(monkeypatch, tmp_path):
@@ -300,9 +302,8 @@ def test_neighbours_are_taken_some_nine_millimetres_away(step_mm, slices):
 
 
 def test_ends_of_the_stack_stand_in_for_missing_neighbours():
-    images = np.arange(5, dtype=np.float32)[:, None, None] * np.ones((1, 2, 2), np.float32)
-    found = with_neighbours(images, 2)[:, :, 0, 0]
-    np.testing.assert_array_equal(found, [[0, 0, 2], [1, 1, 3], [0, 2, 4], [1, 3, 3], [2, 4, 4]])
+    found = [neighbours(number, 2, 4) for number in range(5)]
+    assert found == [(0, 0, 2), (1, 1, 3), (0, 2, 4), (1, 3, 3), (2, 4, 4)]
 
 
 def test_a_blank_image_normalises_to_zero():

@@ -2,15 +2,18 @@
 
 Every slice is held in a breath of its own, and the heart lies elsewhere each time, mostly along
 head and feet. Tilt and slow curvature of the heart's axis are anatomy and stay; what jumps from
-slice to slice is taken for breathing.
+slice to slice is taken for breathing. Long-axis views, where there are any, tell both apart.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.geometry import Float, Label, Mask
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.long_axis import LEAST_STEP_MM, NO_CROSSINGS, Crossings
 
 BREATH_MM = (0.6, 1.0, 2.2)
 """Standard deviation of a breath-hold's place along x, y, z (LPS): along head and feet above all
@@ -23,8 +26,8 @@ BENDS_MM: tuple[tuple[tuple[str, ...], float], ...] = (
     (("left_atrium",), 3.0),
 )
 """Bodies whose centres run nearly straight from slice to slice, and how much they bend: standard
-deviation of half the second difference at slices 10 mm apart. The right ventricle wraps around
-the left and the aorta turns, so they tell nothing."""
+deviation of a centre from the chord of its neighbours at slices 10 mm apart. The right ventricle
+wraps around the left and the aorta turns, so they tell nothing."""
 
 OUTLIER = 2.0
 """A bend this many deviations large counts half: at the base a slice cuts through part of a wall
@@ -37,57 +40,141 @@ LEAST_AREA_MM2 = 150.0
 """A smaller cut through a structure says little of where the slice lies."""
 
 
-def slice_shifts_mm(labels: Label, pixel_mm: float, slice_step_mm: float, axes: Float) -> Float:
-    """In-plane shift of every slice that best explains the jumps of structures' centres.
+VIEW_MM = 6.0
+"""Standard deviation of a long-axis view's place: a breath-hold, or a patient who has moved."""
 
-    The shifts are the most probable ones given normal curvature of the anatomy and normal shifts
-    between breath-holds: linear least squares, outliers weighted down (Cauchy's weights).
+TRUSTED = 3.0
+"""A view is voted out when more than a third of its lines lie farther off what all say, in
+deviations."""
+
+
+def slice_shifts_mm(
+    labels: Label,
+    pixel_mm: float,
+    heights_mm: Float,
+    axes: Float,
+    crossings: Crossings = NO_CROSSINGS,
+) -> Float:
+    """In-plane shift of every slice that best explains where structures and views lie.
+
+    The shifts are the most probable ones given normal curvature of the anatomy, normal shifts
+    between breath-holds and, where there are long-axis views, how far each slice lies from each
+    view: linear least squares, outliers weighted down (Cauchy's weights). Every view has a shift
+    of its own. What moves a slice along the normal cannot be seen in one slice and is left.
+    Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
     ----------
     labels
         ``(phase, slice, row, column)``, apex first.
+    heights_mm
+        ``(slice,)`` heights of the slices along their normal, rising.
     axes
         ``(3, 3)`` rows: LPS directions of columns, rows and slices.
+    crossings
+        How far slices lie from views (`pipeline.imaging.long_axis.find_crossings`). Views that
+        the others contradict are left out.
 
     Returns
     -------
     (slice, 2) array
         How far each slice is displaced along columns and rows, mm; to be taken back.
     """
-    slices = labels.shape[1]
-    differences, bends_mm, deviations_mm = _observations(labels, pixel_mm, slice_step_mm)
-    if not len(bends_mm):
-        return np.zeros((slices, 2))
+    if np.diff(heights_mm).min() < LEAST_STEP_MM:
+        return np.zeros((len(heights_mm), 2))
+    bends = _observations(labels, pixel_mm, heights_mm)
+    if not len(bends.offsets_mm) and not crossings.slices:
+        return np.zeros((len(heights_mm), 2))
     # The breathing ellipsoid seen in the plane is what is known of a shift beforehand.
     covariance = axes[:2] @ np.diag(np.square(BREATH_MM)) @ axes[:2].T
-    prior = np.kron(np.eye(slices), np.linalg.inv(covariance))
-    shifts_mm = np.zeros((slices, 2))
+    while True:
+        known = _joined(bends, _equations(crossings, len(heights_mm)))
+        shifts_mm, left = _solved(known, np.linalg.inv(covariance), len(heights_mm))
+        doubted = _doubted_view(crossings, left[len(bends.offsets_mm) :])
+        if doubted is None:
+            return shifts_mm
+        crossings = crossings.without(doubted)
+
+
+@dataclass(frozen=True, slots=True)
+class _Equations:
+    """Linear equations for the shifts of slices and views."""
+
+    matrix: Float
+    """``(n, slice + view)``, the same for both directions."""
+
+    offsets_mm: Float
+    """``(n, 2)``."""
+
+    precision: Float
+    """``(n, 2, 2)`` inverse covariance, 1/mm2."""
+
+
+def _joined(bends: _Equations, seen: _Equations) -> _Equations:
+    wide = np.zeros((len(bends.matrix), seen.matrix.shape[1]))
+    wide[:, : bends.matrix.shape[1]] = bends.matrix
+    return _Equations(
+        np.concatenate([wide, seen.matrix]),
+        np.concatenate([bends.offsets_mm, seen.offsets_mm]),
+        np.concatenate([bends.precision, seen.precision]),
+    )
+
+
+def _equations(crossings: Crossings, slices: int) -> _Equations:
+    count = max(crossings.views, default=-1) + 1
+    matrix = np.zeros((len(crossings.slices), slices + count))
+    for row, number, view in zip(matrix, crossings.slices, crossings.views, strict=True):
+        row[number], row[slices + view] = 1, -1
+    return _Equations(matrix, crossings.offsets_mm, crossings.precision)
+
+
+def _solved(known: _Equations, of_a_slice: Float, slices: int) -> tuple[Float, Float]:
+    """Shifts ``(slice, 2)``, and how many deviations each equation is off, ``(n,)``."""
+    count = known.matrix.shape[1]
+    prior = np.kron(np.eye(count), np.eye(2) / VIEW_MM**2)
+    prior[: 2 * slices, : 2 * slices] = np.kron(np.eye(slices), of_a_slice)
+    shifts_mm = np.zeros((count, 2))
     for _ in range(ROUNDS):
-        left = np.linalg.norm(bends_mm - differences @ shifts_mm, axis=1) / deviations_mm
-        weight = 1 / (1 + (left / OUTLIER) ** 2) / deviations_mm**2
-        normal = np.kron(differences.T @ (weight[:, None] * differences), np.eye(2)) + prior
-        right = differences.T @ (weight[:, None] * bends_mm)
-        shifts_mm = np.linalg.solve(normal, right.ravel()).reshape(slices, 2)
-    return shifts_mm
+        left_mm = known.offsets_mm - known.matrix @ shifts_mm
+        left = np.sqrt(np.einsum("ni,nij,nj->n", left_mm, known.precision, left_mm))
+        weight = known.precision / (1 + (left / OUTLIER) ** 2)[:, None, None]
+        normal = np.einsum("na,nij,nb->aibj", known.matrix, weight, known.matrix)
+        right = np.einsum("na,nij,nj->ai", known.matrix, weight, known.offsets_mm)
+        both = normal.reshape(2 * count, 2 * count) + prior
+        shifts_mm = np.linalg.solve(both, right.ravel()).reshape(count, 2)
+    return shifts_mm[:slices], left
 
 
-def _observations(
-    labels: Label, pixel_mm: float, slice_step_mm: float
-) -> tuple[Float, Float, Float]:
-    """Linear equations for the shifts: matrix (n, slice), bends (n, 2), deviations (n,)."""
+def _doubted_view(crossings: Crossings, left: Float) -> int | None:
+    """The view that lies farthest off what all say, if it is too far off to be one of them."""
+    of = np.array(crossings.views, int)
+    off = {int(view): float(np.quantile(left[of == view], 2 / 3)) for view in np.unique(of)}
+    worst = max(off, key=lambda view: off[view], default=None)
+    return worst if worst is not None and off[worst] > TRUSTED else None
+
+
+def _observations(labels: Label, pixel_mm: float, heights_mm: Float) -> _Equations:
+    """What the centres of structures say of the shifts of slices."""
     rows, bends_mm, deviations_mm = [], [], []
+    steps_mm = np.diff(heights_mm)
     for names, deviation_mm in BENDS_MM:
         body = np.isin(labels, [LABELS[name] for name in names])
-        found_mm = _bends(_centres_mm(body, pixel_mm))
+        found_mm = _bends(_centres_mm(body, pixel_mm), heights_mm)
         for middle in np.flatnonzero(np.isfinite(found_mm[:, 0])):
+            before_mm, after_mm = steps_mm[middle - 1], steps_mm[middle]
+            share = before_mm / (before_mm + after_mm)
             row = np.zeros(labels.shape[1])
-            row[[middle - 1, middle, middle + 1]] = -0.5, 1.0, -0.5
+            row[[middle - 1, middle, middle + 1]] = share - 1, 1.0, -share
             rows.append(row)
             bends_mm.append(found_mm[middle])
-            # Bends of a smooth axis grow with the square of the step.
-            deviations_mm.append(deviation_mm * (slice_step_mm / 10.0) ** 2)
-    return np.array(rows), np.array(bends_mm), np.array(deviations_mm)
+            # A smooth axis leaves the chord by half its curvature times both parts of the chord.
+            deviations_mm.append(deviation_mm * before_mm * after_mm / 10.0**2)
+    precision = np.array([np.eye(2) / deviation**2 for deviation in deviations_mm])
+    return _Equations(
+        np.array(rows).reshape(-1, labels.shape[1]),
+        np.array(bends_mm).reshape(-1, 2),
+        precision.reshape(-1, 2, 2),
+    )
 
 
 def _centres_mm(mask: Mask, pixel_mm: float) -> Float:
@@ -99,13 +186,15 @@ def _centres_mm(mask: Mask, pixel_mm: float) -> Float:
     return np.stack([over_columns @ columns / area, over_rows @ rows / area], axis=-1)
 
 
-def _bends(centres_mm: Float) -> Float:
-    """Half second differences along the stack, averaged over phases: ``(slice, 2)``, NaN if none.
+def _bends(centres_mm: Float, heights_mm: Float) -> Float:
+    """How far centres lie from the chord of their neighbours, averaged over phases: ``(slice, 2)``.
 
-    A phase counts where the structure is cut by three slices in a row.
+    NaN where there is none; a phase counts where the structure is cut by three slices in a row.
     """
     bends = np.full(centres_mm.shape[1:], np.nan)
-    inner = centres_mm[:, 1:-1] - (centres_mm[:, :-2] + centres_mm[:, 2:]) / 2
+    share = ((heights_mm[1:-1] - heights_mm[:-2]) / (heights_mm[2:] - heights_mm[:-2]))[:, None]
+    chord_mm = (1 - share) * centres_mm[:, :-2] + share * centres_mm[:, 2:]
+    inner = centres_mm[:, 1:-1] - chord_mm
     known = np.isfinite(inner[..., 0])
     total = np.where(known[..., None], inner, 0).sum(axis=0)
     count = known.sum(axis=0)

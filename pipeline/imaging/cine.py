@@ -21,6 +21,7 @@ from pipeline.imaging.frames import (
     left_out_lines,
     slice_positions,
 )
+from pipeline.imaging.spacing import fill_gaps, regular_steps
 
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
@@ -41,6 +42,10 @@ class Cine:
 
     rr_s: float
     """RR interval, averaged over the slices."""
+
+    interpolated: tuple[int, ...] = ()
+    """Slices that were never acquired: the mean of their two neighbours stands in for each. They
+    keep the stack evenly spaced; nothing is to be measured on them."""
 
     @property
     def spacing_mm(self) -> Float:
@@ -69,6 +74,7 @@ def stack_frames(
     where: str,
     rr_source: str | None = None,
     others: Sequence[LeftOut] = (),
+    fill: bool = False,
 ) -> Stack:
     """Sort images, in any order, into one regular stack.
 
@@ -81,6 +87,8 @@ def stack_frames(
         Where the RR interval comes from when the files do not tell it.
     others
         What was no image of a slice; it is listed with the rest in ``left_out``.
+    fill
+        Let the mean of both neighbours stand in for a slice that is missing.
 
     Raises
     ------
@@ -93,12 +101,13 @@ def stack_frames(
     _require_timing(chosen)
     slices, time_name = _in_time(_slices_in_order(chosen), where)
     _require_complete(slices, where)
-    step_mm = _require_regular_steps(slices, where)
+    step_mm, numbers = regular_steps(slices, where, fill)
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
     phases = common_phases(triggers, rr_ms, where)
     mr_from_index = _placement(slices[0][0], step_mm)
-    cine = Cine(_intensity(slices), mr_from_index, phases, float(rr_ms.mean()) / 1000)
+    intensity, missing = fill_gaps(_intensity(slices), numbers)
+    cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
     lines = left_out_lines([*left_out, *others], where)
     return Stack(cine, triggers, rr_ms, source, lines)
@@ -280,27 +289,3 @@ def _require_complete(slices: Sequence[Sequence[Frame]], where: str) -> None:
             f"{where}: missing phase: slice {short[0]} ({slices[short[0]][0].where}) has "
             f"{counts[short[0]]} phases, the others have {usual}; complete or remove the slice"
         )
-
-
-def _require_regular_steps(slices: Sequence[Sequence[Frame]], where: str) -> Float:
-    """Check that the slices are evenly spaced; return the step from one to the next in mm."""
-    positions = np.array([one[0].position_mm for one in slices])
-    steps_mm = np.diff(positions, axis=0)
-    lengths_mm = steps_mm @ slices[0][0].normal
-    usual_mm = float(lengths_mm.min())
-    ratio = lengths_mm / usual_mm
-    wide = np.flatnonzero((ratio > 1.5) & (np.abs(ratio - np.rint(ratio)) < 0.1))
-    if len(wide):
-        raise InputError(
-            f"{where}: missing slice between {slices[wide[0]][0].where} and "
-            f"{slices[wide[0] + 1][0].where}: {lengths_mm[wide[0]]:.2f} mm apart, the others are "
-            f"{usual_mm:.2f} mm apart; add the missing slice"
-        )
-    off_mm = np.abs(steps_mm - np.median(steps_mm, axis=0)).max()
-    if off_mm > max(0.1, 0.02 * usual_mm):
-        raise InputError(
-            f"{where}: slices have different spacing: steps along the normal are "
-            f"{lengths_mm.round(2).tolist()} mm, or the slices are shifted sideways by "
-            f"{off_mm:.2f} mm; an evenly spaced stack is needed"
-        )
-    return np.asarray(steps_mm.mean(axis=0))

@@ -1,12 +1,16 @@
-"""Anatomy put right: one body a structure, no islands, no holes."""
+"""Anatomy put right: one body a structure, no islands, no holes, a closed and smooth ventricle."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
-from pipeline.geometry import Float32, Label, Mask
+from pipeline.geometry import Float32, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.view import PIXEL_MM
+
+CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
@@ -33,17 +37,77 @@ LEAP, LEAP_PIXELS = 1.4, 40
 before it towards the tip: room for an aneurysm, which widens by degrees."""
 
 
-def clean_probability(probability: Float32) -> Float32:
+NOTCH_MM = 15.0
+"""Muscle that a disc of this radius, rolled along the cavity's outline, cannot reach is drawn as
+cavity: readers leave papillary muscles and trabeculae inside a smooth contour (Petersen et al.,
+J. Cardiovasc. Magn. Reson. 19:18, 2017). A septum that bows inwards is wider, and stays."""
+
+LEAST_WALL_MM = 3.0
+"""Thickness at which a wall that the labels interrupt is closed; also what smoothing the cavity
+leaves of one."""
+
+OPENINGS = ("left_atrium", "aorta")
+"""What the left ventricle's cavity opens into."""
+
+CLOSED_SHARE = 0.6
+"""A cavity with this share of muscle about it is taken for a ring that must be closed."""
+
+
+def clean_cycle(value: Float32, pixel_mm: float = PIXEL_MM) -> None:
+    """Put the anatomy of all phases right, in place.
+
+    Every phase is treated by `clean_probability`; the plane at which the left ventricle ends is
+    one for all phases, for its tip hardly moves while the base comes towards it.
+
+    Parameters
+    ----------
+    value
+        ``(phase, plane, class, row, column)``, planes from the apex to the base; class 0 is the
+        background.
+    pixel_mm
+        Distance between rows and between columns.
+    """
+    tip = ventricle_tip(value)
+    for phase, probability in enumerate(value):
+        value[phase] = clean_probability(probability, tip, pixel_mm)
+
+
+def ventricle_tip(value: Float32) -> int:
+    """The plane nearest the apex that can hold the left ventricle, seen over all phases.
+
+    From its widest plane towards the tip the ventricle ends where it would leap to a larger cut:
+    bright fat around the tip looks like a cavity, and its rim like muscle.
+    """
+    cuts = np.zeros(value.shape[1])
+    for probability in value:
+        drawn = probability.argmax(axis=1)
+        cuts += ((drawn == CAVITY) | (drawn == MUSCLE)).sum(axis=(1, 2))
+    cuts /= len(value)
+    for number in range(int(cuts.argmax()) - 1, -1, -1):
+        if _leaps(cuts[number], cuts[number + 1]):
+            return number + 1
+    return 0
+
+
+def clean_probability(
+    probability: Float32, tip: int | None = None, pixel_mm: float = PIXEL_MM
+) -> Float32:
     """Take probability from structures where anatomy rules them out.
 
     The heart is one body and so is each of its structures; what lies enclosed by the heart in a
-    plane belongs to it; the tip of the left ventricle is muscle. Where a structure is ruled out,
-    the next most probable class takes over.
+    plane belongs to it; the tip of the left ventricle is muscle; its cavity is drawn smooth, goes
+    on from plane to plane, and has muscle all around it where it has muscle around most of it.
+    Where a structure is ruled out, the next most probable class takes over.
 
     Parameters
     ----------
     probability
         ``(plane, class, row, column)`` of one phase; class 0 is the background.
+    tip
+        First plane that can hold the left ventricle (`ventricle_tip`); by default found from this
+        phase alone.
+    pixel_mm
+        Distance between rows and between columns.
 
     Returns
     -------
@@ -54,17 +118,23 @@ def clean_probability(probability: Float32) -> Float32:
     box = _bounding_box(labels)
     if box is None:
         return probability
+    if tip is None:
+        tip = ventricle_tip(probability[None])
     cleaned = probability.copy()
-    part = cleaned[box[0], :, box[1], box[2]]
+    part = cleaned[:, :, box[1], box[2]]
     _join_auricle(part)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
     part[:, 1:] *= _largest_body((labels > 0) | enclosed)[:, None]
     part[:, 0] *= ~enclosed
+    # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
+    _smooth_cavity(part, pixel_mm)
+    _bridge_cavity(part)
     _keep_bodies(part)
-    _close_apex(part)
+    _close_apex(part, tip)
     # What took over where something was ruled out may be an island itself.
     _keep_bodies(part)
+    _close_ring(part, pixel_mm)
     total = part.sum(axis=1, keepdims=True)
     # All classes ruled out: background is what is left.
     part[:, 0] = np.where(total[:, 0] > 0, part[:, 0], 1)
@@ -136,36 +206,110 @@ def _keep_bodies(part: Float32) -> None:
         part[:, value] *= ~(mask & ~_largest_body(mask))
 
 
-def _close_apex(part: Float32) -> None:
+def _close_apex(part: Float32, tip: int) -> None:
     """Take from the tip of the left ventricle what cannot be it, in place.
 
-    From its widest plane towards the tip, the cavity ends where its muscle no longer surrounds
-    it, and the ventricle where it would leap to a larger cut: bright fat around the tip looks
-    like a cavity in a slice that only grazes the muscle, and its rim like muscle.
+    Nothing of it lies before plane ``tip``; its cavity ends where muscle no longer surrounds it,
+    or where it would leap to a larger cut.
     """
-    cavity, muscle = LABELS["lv_cavity"], LABELS["lv_myocardium"]
     labels = part.argmax(axis=1)
-    inside, whole = labels == cavity, (labels == cavity) | (labels == muscle)
-    widest = int((labels == muscle).sum(axis=(1, 2)).argmax())
-    has_cavity = has_muscle = True
+    inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
+    widest = int((labels == MUSCLE).sum(axis=(1, 2)).argmax())
+    has_cavity = True
     for number in range(widest, -1, -1):
         above = min(number + 1, widest)
         border = labels[number][ndimage.binary_dilation(inside[number]) & ~inside[number]]
         surrounded = inside[number].any() and (border == 0).mean() < OPEN_SHARE
-        has_muscle = has_muscle and not _leaps(whole[number], whole[above])
-        leaps = _leaps(inside[number], inside[above])
-        has_cavity = has_cavity and has_muscle and surrounded and not leaps
+        leaps = _leaps(float(inside[number].sum()), float(inside[above].sum()))
+        has_cavity = has_cavity and number >= tip and bool(surrounded) and not leaps
         # Nothing but muscle or background lies there: no other chamber reaches the tip.
         if not has_cavity:
-            others = [value for value in LABELS.values() if value != muscle]
+            others = [value for value in LABELS.values() if value != MUSCLE]
             part[number, others] *= ~inside[number]
-        if not has_muscle:
-            part[number, muscle] *= ~whole[number]
+        if number < tip:
+            part[number, MUSCLE] *= ~whole[number]
 
 
-def _leaps(cut: Mask, above: Mask) -> bool:
+def _leaps(cut: float, above: float) -> bool:
     """Whether a body's cut is larger than the neighbouring one by more than anatomy allows."""
-    return bool(cut.sum() > LEAP * above.sum() + LEAP_PIXELS)
+    return cut > LEAP * above + LEAP_PIXELS
+
+
+def _bridge_cavity(part: Float32) -> None:
+    """Give muscle without a cavity the cavity that rings on both sides of it share, in place."""
+    labels = part.argmax(axis=1)
+    cavity = labels == CAVITY
+    # Bright fat beyond the tip is no ring.
+    held = np.array([k for k, plane in enumerate(labels) if _ringed(plane) > CLOSED_SHARE], int)
+    if not len(held):
+        return
+    for number in np.flatnonzero(~cavity.any(axis=(1, 2))):
+        if not held[0] < number < held[-1]:
+            continue
+        below, above = held[held < number][-1], held[held > number][0]
+        shared = cavity[below] & cavity[above] & (part[number].argmax(axis=0) == MUSCLE)
+        _hand_over(part[number], shared, CAVITY)
+
+
+def _ringed(plane: Label | Integer) -> float:
+    """Share of muscle in what the cavity borders on in a plane; 0 where there is no cavity."""
+    cavity = plane == CAVITY
+    border = plane[ndimage.binary_dilation(cavity) & ~cavity]
+    return float((border == MUSCLE).mean()) if len(border) else 0.0
+
+
+def _smooth_cavity(part: Float32, pixel_mm: float) -> None:
+    """Draw as cavity the muscle in notches of the cavity's outline, in place."""
+    disc = _disc(NOTCH_MM / pixel_mm)
+    room = disc.shape[0]
+    labels = part.argmax(axis=1)
+    for number, plane in enumerate(labels):
+        cavity = _largest_body((plane == CAVITY)[None])[0].astype(np.uint8)
+        if not cavity.any():
+            continue
+        closed = cv2.morphologyEx(np.pad(cavity, room), cv2.MORPH_CLOSE, disc)[
+            room:-room, room:-room
+        ]
+        ventricle = np.pad((plane == CAVITY) | (plane == MUSCLE), 1)
+        to_outside = cv2.distanceTransform(
+            ventricle.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+        )[1:-1, 1:-1]
+        deep = to_outside * pixel_mm > LEAST_WALL_MM
+        _hand_over(part[number], (closed > 0) & (plane == MUSCLE) & deep, CAVITY)
+
+
+def _close_ring(part: Float32, pixel_mm: float) -> None:
+    """Put muscle where it is missing between a cavity that it surrounds and what is no cavity.
+
+    Planes in which the cavity borders on an atrium or the aorta are left alone: there the ring is
+    open.
+    """
+    disc = _disc(LEAST_WALL_MM / pixel_mm)
+    for chance, plane in zip(part, part.argmax(axis=1), strict=True):
+        cavity = plane == CAVITY
+        if not cavity.any():
+            continue
+        around = (cv2.dilate(cavity.astype(np.uint8), disc) > 0) & ~cavity
+        beside = plane[around]
+        opens = np.isin(beside, [LABELS[name] for name in OPENINGS]).any()
+        if not opens and (beside == MUSCLE).mean() > CLOSED_SHARE:
+            gap = around & (plane != MUSCLE)
+            chance[:, gap] = 0
+            chance[MUSCLE, gap] = 1
+
+
+def _hand_over(chance: Float32, where: Mask, value: int) -> None:
+    """Give one class all that the ventricle's two have, ``(class, row, column)``, in place."""
+    both = chance[CAVITY] + chance[MUSCLE]
+    for one in (CAVITY, MUSCLE):
+        chance[one][where] = both[where] if one == value else 0
+
+
+def _disc(radius: float) -> Label:
+    """A brush of ones within ``radius`` pixels."""
+    reach = int(np.ceil(radius))
+    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    return np.asarray(np.hypot(rows, columns) <= radius, np.uint8)
 
 
 def _enclosed(background: Mask) -> Mask:

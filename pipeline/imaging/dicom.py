@@ -14,6 +14,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame, LeftOut, left_out_lines
+from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
 
 Groups = Callable[[str], Any]
 """One frame's functional group by name; the whole object for a classic image."""
@@ -36,7 +37,7 @@ def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
     """Read every DICOM file below ``folder``, classic or Enhanced, as one cine stack.
 
     The folder may hold other images too (long-axis views, localisers, derived images, reports):
-    they are listed in the stack's ``left_out``.
+    they are listed in the stack's ``left_out``. `read_dicom_study` gives the views too.
 
     Parameters
     ----------
@@ -48,6 +49,17 @@ def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
     InputError
         When a file is not readable or truncated, an MR image has no place in space, the stack's
         images have no trigger time, or they do not make up a regular stack.
+    """
+    return read_dicom_study(folder, rr_ms)[0]
+
+
+def read_dicom_study(
+    folder: Path, rr_ms: float | None = None, fill: bool = False
+) -> tuple[Stack, tuple[LongAxis, ...]]:
+    """As `read_dicom_cine`, with the long-axis views that lie beside the stack.
+
+    ``fill`` lets the mean of both neighbours stand in for a slice that is missing.
+    Which images are such views, `pipeline.imaging.long_axis_series.long_axis_views` says.
     """
     paths = sorted(
         path
@@ -69,7 +81,9 @@ def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
     if not frames:
         found = "; ".join(left_out_lines(others, str(folder)))
         raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
-    return stack_frames(frames, str(folder), None if rr_ms is None else "study.yaml", others)
+    source = None if rr_ms is None else "study.yaml"
+    stack = stack_frames(frames, str(folder), source, others, fill)
+    return stack, long_axis_views(frames, stack.cine)
 
 
 def _read(path: Path) -> Any:
@@ -166,6 +180,7 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
             series=_series_name(dataset),
             series_uid=str(dataset.get("SeriesInstanceUID", "")),
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
+            frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
         )
     except (ValueError, TypeError, IndexError) as error:
         raise InputError(

@@ -24,7 +24,7 @@ class Ecg:
     """A recording of one or more leads, evenly sampled."""
 
     signal_mv: Float
-    """``(n, leads)`` millivolts, finite; no lead is constant."""
+    """``(n, leads)`` millivolts; unless gaps were asked for, finite, and no lead constant."""
 
     leads: tuple[str, ...]
     """Name of each column."""
@@ -36,7 +36,7 @@ class Ecg:
     """Time of the first sample on the recording's own clock."""
 
 
-def read_ecg(path: Path) -> Ecg:
+def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
     """Read one recording.
 
     Parameters
@@ -44,6 +44,9 @@ def read_ecg(path: Path) -> Ecg:
     path
         A WFDB record (its stem, or its ``.hea`` or ``.dat`` file), a ``.csv`` table (a header row,
         first column ``time_s``, then one column of millivolts a lead), or a DICOM waveform file.
+    gaps
+        Take leads with missing samples (not a number then) and constant ones too, as long as there
+        is another; leave out channels of a WFDB record that are no voltage.
 
     Raises
     ------
@@ -54,7 +57,7 @@ def read_ecg(path: Path) -> Ecg:
     path = Path(path)
     header = path.with_suffix(".hea") if path.suffix == ".dat" else Path(f"{path}.hea")
     if path.suffix == ".hea" or header.is_file():
-        ecg = _read_wfdb(path if path.suffix == ".hea" else header)
+        ecg = _read_wfdb(path if path.suffix == ".hea" else header, gaps)
     elif not path.is_file():
         raise InputError(
             f"{path}: no such ECG; neither this file nor {header.name} exists; name a WFDB record, "
@@ -64,7 +67,7 @@ def read_ecg(path: Path) -> Ecg:
         ecg = _read_csv(path)
     else:
         ecg = _read_dicom(path)
-    _require_usable(ecg, path)
+    _require_usable(ecg, path, gaps)
     return ecg
 
 
@@ -76,7 +79,7 @@ def _quiet_wfdb() -> Iterator[Any]:
         yield importlib.import_module("wfdb")
 
 
-def _read_wfdb(header: Path) -> Ecg:
+def _read_wfdb(header: Path, gaps: bool) -> Ecg:
     """Read a record by its ``.hea`` file."""
     if not header.is_file():
         raise InputError(f"{header}: no such file; a WFDB record needs its .hea and .dat files")
@@ -89,9 +92,18 @@ def _read_wfdb(header: Path) -> Ecg:
             f"{header}: cannot be read as a WFDB record ({error}); it needs a whole header and "
             "every .dat file it names, of the length it gives; copy the record again"
         ) from error
-    factors = [_millivolts(unit, str(header)) for unit in record.units]
-    signal_mv = np.asarray(record.p_signal, dtype=float) * factors
-    return Ecg(signal_mv, tuple(record.sig_name), float(record.fs))
+    return _wfdb_leads(record, header, gaps)
+
+
+def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:
+    """The channels of a record in millivolts."""
+    if record.p_signal is None or not record.n_sig:
+        raise InputError(f"{header}: holds no signal; a WFDB record of an ECG is needed")
+    voltages = [k for k, unit in enumerate(record.units) if _is_voltage(unit)]
+    kept = voltages if gaps and voltages else list(range(record.n_sig))
+    factors = [_millivolts(record.units[k], str(header)) for k in kept]
+    signal_mv = np.asarray(record.p_signal, dtype=float)[:, kept] * factors
+    return Ecg(signal_mv, tuple(record.sig_name[k] for k in kept), float(record.fs))
 
 
 def _read_csv(path: Path) -> Ecg:
@@ -189,15 +201,22 @@ def _lead_name(channel: Any) -> str:
     return str(channel.ChannelSourceSequence[0].CodeMeaning).removeprefix("Lead ").strip()
 
 
+def _unit(unit: str) -> str:
+    return unit.strip().replace("µ", "u").replace("μ", "u").lower()
+
+
+def _is_voltage(unit: str) -> bool:
+    return _unit(unit) in MILLIVOLTS
+
+
 def _millivolts(unit: str, where: str) -> float:
     """Millivolts in one ``unit``."""
-    name = unit.strip().replace("µ", "u").replace("μ", "u").lower()
-    if name not in MILLIVOLTS:
+    if not _is_voltage(unit):
         raise InputError(f"{where}: a lead is in {unit!r}; it needs a voltage: V, mV, uV or nV")
-    return MILLIVOLTS[name]
+    return MILLIVOLTS[_unit(unit)]
 
 
-def _require_usable(ecg: Ecg, path: Path) -> None:
+def _require_usable(ecg: Ecg, path: Path, gaps: bool) -> None:
     """Refuse leads that hold no heartbeat, naming each of them."""
     if not ecg.sampling_rate_hz > 0 or not np.isfinite(ecg.sampling_rate_hz):
         raise InputError(f"{path}: sampling rate is {ecg.sampling_rate_hz} Hz; it must be positive")
@@ -210,6 +229,11 @@ def _require_usable(ecg: Ecg, path: Path) -> None:
             problems.append(f"lead {name}: {missing} of {len(lead)} samples are not a number")
         elif np.ptp(lead) == 0:
             problems.append(f"lead {name}: constant at {lead[0]:g} mV, as of a loose electrode")
-    if problems:
+    if problems and not (gaps and any(_varies(lead) for lead in ecg.signal_mv.T)):
         what = "; ".join(problems)
         raise InputError(f"{path}: {what}; leave such leads out of the file, or cut the gaps")
+
+
+def _varies(lead: Float) -> bool:
+    seen = lead[np.isfinite(lead)]
+    return len(seen) > 0 and bool(np.ptp(seen) > 0)

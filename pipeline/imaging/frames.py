@@ -62,6 +62,9 @@ class Frame:
     kind: str = ORIGINAL
     """What sort of image it is, such as ``original``, ``derived`` or ``phase``."""
 
+    frame_of_reference: str = ""
+    """What tells apart the frames in which positions are given; empty when the file does not."""
+
     @property
     def normal(self) -> Float:
         """Unit normal of the slice, right-handed."""

@@ -1,37 +1,39 @@
-"""Run the network over a cine: find the heart, then label all its slices and phases."""
+"""Run the network over a cine: label all slices and phases of a view."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy import ndimage
 
-from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.network import (
     CLASSES,
-    MULTIPLE,
     PLANES,
     neighbour_steps,
+    neighbours,
     normalise,
+    normalise_locally,
     predict,
-    with_neighbours,
 )
-from pipeline.imaging.view import PIXEL_MM, View, view_of
+from pipeline.imaging.view import View
 
 Progress = Callable[[int, int], None]
-
-SURROUNDINGS_MM = 30.0
-"""Room left around the heart found at first sight: what it beats into, and what tells it apart."""
 
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
 
-LEAST_FOUND_MM2 = 400.0
-"""Cut area, over all slices, below which what was found is not a heart."""
+LOOKS = 600
+"""Images that the network is shown in a study at most, where some can be shown in several ways."""
+
+
+TURNS_DEG = (10.0, -10.0, 0.0, 20.0, -20.0)
+"""In-plane turns in which images are shown, in the order in which they are taken where there are
+two or more; well within those of training. Other scales, shifts of half a pixel and other grey
+scales were tried and gain less or nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,83 +62,84 @@ class PlaneProbability:
         return self.value[phase, middle :: self.planes_a_slice]
 
 
-def locate_heart(cine: Cine) -> View:
-    """The part of the images that holds the heart, found in two phases over the whole field.
+def _sampled(cine: Cine, view: View, phase: int, number: int) -> Float32:
+    """One slice's image on the view; where slices are thin, the average over a thickness."""
+    together = max(1, round(THICKNESS_MM / view.slice_step_mm))
+    near = range(max(0, number - together // 2), min(len(view.order), number + together // 2 + 1))
+    # An even number of slices lies evenly about the one when the outer two count half.
+    weights = [min(1.0, (together + 1) / 2 - abs(one - number)) for one in near]
+    images = [view.sample(cine.intensity[phase, view.order[one]], one) for one in near]
+    return np.asarray(np.average(images, axis=0, weights=weights), np.float32)
 
-    Raises
-    ------
-    StageError
-        When the network sees no heart anywhere.
+
+def network_images(
+    cine: Cine, view: View, phase: int, chosen: Sequence[int], local: bool = False
+) -> Float32:
+    """What `predict` takes for some slices, counted from the apex.
+
+    ``local`` is for a whole field, where grey values are normalised part by part.
     """
-    view = _padded(view_of(cine))
-    step = neighbour_steps(view.slice_step_mm)
-    # Slices a neighbour's distance apart are enough to find it by; so are two phases.
-    chosen = range(step // 2, len(view.order), step)
-    seen = np.zeros((len(chosen), *view.shape), np.float32)
-    tried = sorted({0, len(cine.intensity) // 3})
-    for phase in tried:
-        images = np.stack([normalise(image) for image in _sampled(cine, view, phase)])
-        batch = with_neighbours(images, step)
-        # One slice at a time: over the whole field all classes would fill the memory.
-        for place, number in enumerate(chosen):
-            seen[place] += 1 - predict(batch[number : number + 1])[0, PLANES // 2, 0]
-    parts, found = ndimage.label(seen / len(tried) > 0.5)
-    sizes = np.bincount(parts.ravel())[1:] if found else np.zeros(1)
-    if sizes.max() * PIXEL_MM**2 < LEAST_FOUND_MM2:
-        raise StageError(
-            f"no heart found in slices 0 to {len(view.order) - 1}, phases {tried}: the largest "
-            f"area taken for heart is {sizes.max() * PIXEL_MM**2:.0f} mm2 over all slices; check "
-            "that the study is a cardiac cine and that its orientation is right (`inspect`)"
-        )
-    _, rows, columns = ndimage.find_objects((parts == sizes.argmax() + 1).astype(np.uint8))[0]
-    return _around(view, rows, columns)
+    step, last = neighbour_steps(view.slice_step_mm), len(view.order) - 1
+    needed = {near for one in chosen for near in neighbours(one, step, last)}
+    images = {}
+    for number in sorted(needed):
+        known = view.holds(number, cine.intensity.shape[2:])
+        image = _sampled(cine, view, phase, number)
+        images[number] = (normalise_locally if local else normalise)(image, known)
+    return np.stack(
+        [np.stack([images[near] for near in neighbours(one, step, last)]) for one in chosen]
+    )
 
 
-def _padded(view: View) -> View:
-    """The view with sides that the network takes."""
-    rows, columns = (-(-side // MULTIPLE) * MULTIPLE for side in view.shape)
-    return view.cropped((0, 0), (rows, columns))
-
-
-def _around(view: View, rows: slice, columns: slice) -> View:
-    """The part of a view around a box of pixels, with sides that the network takes."""
-    room = SURROUNDINGS_MM / PIXEL_MM
-    first, shape = [], []
-    for box in (rows, columns):
-        side = int(np.ceil((box.stop - box.start + 2 * room) / MULTIPLE)) * MULTIPLE
-        first.append(round((box.start + box.stop - side) / 2))
-        shape.append(side)
-    return view.cropped((first[0], first[1]), (shape[0], shape[1]))
-
-
-def _sampled(cine: Cine, view: View, phase: int) -> Float32:
-    """Images of one phase on the view, apex first, thin slices averaged: (slice, row, column)."""
-    images = [view.sample(cine.intensity[phase, z], number) for number, z in enumerate(view.order)]
-    together = round(THICKNESS_MM / view.slice_step_mm)
-    stack = np.stack(images)
-    if together > 1:
-        stack = ndimage.uniform_filter1d(stack, together, axis=0, mode="nearest")
-    return stack
-
-
-def label_probability(cine: Cine, view: View, progress: Progress | None = None) -> PlaneProbability:
+def label_probability(
+    cine: Cine, view: View, most_views: int = 1, progress: Progress | None = None
+) -> PlaneProbability:
     """Probabilities of all classes in all phases on the planes that the slices give.
 
     Each slice gives three planes where its neighbours are the stack's own; where slices lie
-    closer than that, only its own.
+    closer than that, only its own. A study of few images is shown turned in up to ``most_views``
+    ways (`TURNS_DEG`), whose probabilities are averaged.
     """
     step = neighbour_steps(view.slice_step_mm)
-    keep = slice(None) if step == 1 else slice(PLANES // 2, PLANES // 2 + 1)
     planes = PLANES if step == 1 else 1
     phases, slices = len(cine.intensity), len(view.order)
+    count = count_turns(phases * slices, most_views)
+    turns_deg = TURNS_DEG[:count] if count > 1 else (0.0,)
     value = np.empty((phases, slices * planes, CLASSES, *view.shape), np.float32)
     for phase in range(phases):
-        images = np.stack([normalise(image) for image in _sampled(cine, view, phase)])
-        chance = predict(with_neighbours(images, step))[:, keep]
-        value[phase] = chance.reshape(-1, CLASSES, *view.shape)
+        total = np.zeros((slices, planes, CLASSES, *view.shape), np.float32)
+        for turn_deg in turns_deg:
+            total += _predicted(cine, view, phase, turn_deg)[:, _kept(planes)]
+        value[phase] = (total / count).reshape(-1, CLASSES, *view.shape)
         if progress is not None:
             progress(phase + 1, phases)
     return PlaneProbability(value, view, planes)
+
+
+def count_turns(images: int, most: int) -> int:
+    """In how many ways each of ``images`` is shown, at most ``most``, at least 1."""
+    return int(np.clip(LOOKS // images, 1, min(most, len(TURNS_DEG))))
+
+
+def _kept(planes: int) -> slice:
+    """Which of the network's planes are used: all, or the middle one."""
+    return slice(None) if planes == PLANES else slice(PLANES // 2, PLANES // 2 + 1)
+
+
+def _predicted(cine: Cine, view: View, phase: int, turn_deg: float) -> Float32:
+    """Probabilities ``(slice, plane, class, row, column)`` on the view, seen turned."""
+    seen = view.varied(turn_deg) if turn_deg else view
+    chance = predict(network_images(cine, seen, phase, range(len(view.order))))
+    if not turn_deg:
+        return chance
+    matrix = view.pixels_of(seen)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    carried = np.empty_like(chance)
+    for place in np.ndindex(*chance.shape[:3]):
+        carried[place] = cv2.warpAffine(chance[place], matrix, view.shape[::-1], flags=flags)
+    # Outside what was seen nothing is probable: there background is what remains of 1.
+    carried[:, :, 0] = 1 - carried[:, :, 1:].sum(axis=2)
+    return carried
 
 
 def blend_phases(value: Float32, share: float) -> None:

@@ -12,11 +12,23 @@ import cv2
 import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
+from pipeline.imaging.labels import LABELS
 
 BAND_MM = 4.0
 """Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
 slope still be followed; the seam between two structures that end against each other is notched
 by a third of this at its rim."""
+
+TAPER_MM = 10.0
+"""How a structure tapers towards an end of the stack is told by its areas this near to it."""
+
+LID_MM = 2.0
+"""Muscle below the cavity at the tip of the left ventricle, where no slice shows it."""
+
+CAP_STEP_MM = 1.5
+"""Distance of the planes by which ends are rounded off."""
+
+CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
 REFINE = 2
 """In-plane refinement of the outlines: distances are exact to a quarter of a pixel."""
@@ -27,7 +39,7 @@ def isotropic_labels(
     pixel_mm: float,
     plane_mm: Float,
     shifts_mm: Float,
-    gap_mm: float,
+    reach_mm: float,
     grid_mm: float,
     margin_mm: float,
 ) -> tuple[Label, Float]:
@@ -43,8 +55,9 @@ def isotropic_labels(
         ``(plane,)`` heights of the planes, rising.
     shifts_mm
         ``(plane, 2)`` displacement of each plane along columns and rows, taken back here.
-    gap_mm
-        Distance from the outer slices at which the next would have lain: the heart ends before.
+    reach_mm
+        How far beyond the outer planes the heart reaches at the most. Half a step beyond the
+        outer slice is what volumes summed slice by slice assume.
     grid_mm, margin_mm
         Spacing of the grid, and the empty space around the heart.
 
@@ -55,8 +68,8 @@ def isotropic_labels(
         rows and heights, from the centre of pixel (0, 0) at height 0.
     """
     cut = _cut_around(probability, margin_mm, pixel_mm)
-    below_mm, above_mm = plane_mm[0] - gap_mm, plane_mm[-1] + gap_mm
-    height_mm = np.arange(below_mm, above_mm + grid_mm / 2, grid_mm)
+    below_mm, above_mm = plane_mm[0] - reach_mm, plane_mm[-1] + reach_mm
+    height_mm = np.arange(below_mm, above_mm + grid_mm, grid_mm)
     phases = []
     for one in probability[:, :, :, cut[0], cut[1]]:
         depth_mm = np.stack(
@@ -65,7 +78,7 @@ def isotropic_labels(
                 for plane, shift_mm in zip(one, shifts_mm, strict=True)
             ]
         )
-        closed_mm, closed_plane_mm = close_ends(depth_mm, plane_mm, gap_mm)
+        closed_mm, closed_plane_mm = close_ends(depth_mm, plane_mm, reach_mm)
         phases.append(interpolate_planes(closed_mm, closed_plane_mm, height_mm))
     volume = np.stack(phases)
     first, last = _heights_with_heart(volume, round(margin_mm / grid_mm))
@@ -180,38 +193,66 @@ def interpolate_planes(depth_mm: Float32, plane_mm: Float, height_mm: Float) -> 
     return volume
 
 
-def close_ends(depth_mm: Float32, plane_mm: Float, gap_mm: float) -> tuple[Float32, Float]:
+def close_ends(depth_mm: Float32, plane_mm: Float, reach_mm: float) -> tuple[Float32, Float]:
     """Round off what the stack cuts: planes beyond either end on which structures shrink away.
 
-    The square of a structure's in-radius is carried on along the normal in a straight line, as in
-    an ellipsoid, from its last two planes; a structure that grows towards the end keeps its size.
-    Nothing reaches further than ``gap_mm``, where the next slice would have shown it.
+    The area of a structure is carried on along the normal in a straight line, as in a paraboloid,
+    from what it was within `TAPER_MM` of the end; nothing reaches further than ``reach_mm``. The
+    left ventricle shrinks as one body, and at the apex, where the planes begin, its cavity ends
+    `LID_MM` before its muscle does.
 
     Returns
     -------
     depth, heights
         As given, with planes added at both ends; the outermost hold background only.
     """
-    below, below_mm = _cap(depth_mm[:2], plane_mm[:2], gap_mm)
-    above, above_mm = _cap(depth_mm[:-3:-1], plane_mm[:-3:-1], gap_mm)
+    rising = np.concatenate([[True], plane_mm[1:] - plane_mm[0] < TAPER_MM + 1e-6])
+    rising[:2] = True
+    falling = np.concatenate([plane_mm[-1] - plane_mm[:-1] < TAPER_MM + 1e-6, [True]])
+    falling[-2:] = True
+    below, below_mm = _cap(depth_mm[rising], plane_mm[rising], reach_mm, LID_MM)
+    above, above_mm = _cap(depth_mm[falling][::-1], plane_mm[falling][::-1], reach_mm, 0.0)
     depth = np.concatenate([below[::-1], depth_mm, above])
     return depth, np.concatenate([below_mm[::-1], plane_mm, above_mm])
 
 
-def _cap(last_two: Float32, height_mm: Float, gap_mm: float) -> tuple[Float32, Float]:
-    """Planes outwards from ``last_two[0]``, the outermost plane of the stack."""
-    step_mm = height_mm[0] - height_mm[1]
-    count = max(1, int(np.ceil(gap_mm / abs(step_mm) - 1e-6)))
-    reach_mm = gap_mm / count
-    radius_mm = np.maximum(last_two.max(axis=(2, 3)), 0)
-    slope = (radius_mm[0] ** 2 - radius_mm[1] ** 2) / abs(step_mm)
+def _cap(outer: Float32, height_mm: Float, reach_mm: float, lid_mm: float) -> tuple[Float32, Float]:
+    """Planes outwards from ``outer[0]``, the outermost plane of the stack."""
+    bodies, walled = _bodies(outer)
+    away_mm = np.abs(height_mm - height_mm[0])
+    ends_mm = np.minimum(reach_mm, _ends_mm(bodies, away_mm))
+    if walled:
+        ends_mm[CAVITY] = min(ends_mm[CAVITY], max(ends_mm[MUSCLE] - lid_mm, 0.0))
+    count = max(2, int(np.ceil(reach_mm / CAP_STEP_MM)))
+    beyond_mm = reach_mm * np.arange(1, count + 1) / count
+    radius_mm = np.maximum(bodies[0].max(axis=(1, 2)), 0)
     planes = []
-    for number in range(1, count + 1):
-        square = radius_mm[0] ** 2 + np.minimum(slope, 0) * number * reach_mm
-        shrunk_mm = np.sqrt(np.maximum(square, 0)) if number < count else 0 * square
-        plane = last_two[0] - (radius_mm[0] - shrunk_mm)[:, None, None].astype(np.float32)
-        plane[1:][shrunk_mm[1:] <= 0] = -np.inf
+    for way_mm in beyond_mm:
+        left = np.maximum(1 - way_mm / np.maximum(ends_mm, 1e-6), 0)
+        plane = bodies[0] - (radius_mm * (1 - np.sqrt(left)))[:, None, None].astype(np.float32)
+        plane[1:][left[1:] <= 0] = -np.inf
+        if walled:
+            plane[MUSCLE] = np.minimum(plane[MUSCLE], -plane[CAVITY])
         plane[0] = -np.maximum(plane[1:].max(axis=0), -BAND_MM)
         planes.append(plane)
-    heights = height_mm[0] + np.sign(step_mm) * reach_mm * np.arange(1, count + 1)
-    return np.stack(planes), heights
+    outwards = np.sign(height_mm[0] - height_mm[1])
+    return np.stack(planes), height_mm[0] + outwards * beyond_mm
+
+
+def _bodies(depth_mm: Float32) -> tuple[Float32, bool]:
+    """Depths with the left ventricle's cavity counted to its muscle, where there is muscle."""
+    classes = depth_mm.shape[1]
+    walled = classes > max(CAVITY, MUSCLE) and bool((depth_mm[0, MUSCLE] > 0).any())
+    if not walled:
+        return depth_mm, False
+    bodies = depth_mm.copy()
+    bodies[:, MUSCLE] = np.maximum(depth_mm[:, MUSCLE], depth_mm[:, CAVITY])
+    return bodies, True
+
+
+def _ends_mm(bodies: Float32, away_mm: Float) -> Float:
+    """How far beyond the first plane each body's area, falling in a straight line, is nil."""
+    area = (bodies > 0).sum(axis=(2, 3)).astype(float)
+    from_mean_mm = away_mm - away_mm.mean()
+    growth = from_mean_mm @ area / (from_mean_mm @ from_mean_mm)
+    return np.asarray(area[0] / np.maximum(growth, 1e-9))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.geometry import Float32
+from pipeline.geometry import Float32, Mask
 from pipeline.imaging.labels import LABELS
 
 WEIGHTS = Path(__file__).parent / "weights" / "heart.onnx"
@@ -23,6 +23,9 @@ MULTIPLE = 32
 """Images need sides that divide by this."""
 
 BATCH = 8
+
+WINDOW = 128
+"""Pixels along each side of the images that the network was trained on."""
 
 NEIGHBOUR_MM = 9.0
 """Distance of neighbours that the network was trained around."""
@@ -75,13 +78,54 @@ def predict(images: Float32) -> Float32:
     return np.asarray(chance, np.float32)
 
 
-def normalise(images: Float32) -> Float32:
-    """Grey values of one slice with the 1st percentile at 0 and the 99th at 1, cut off outside.
+def normalise(image: Float32, known: Mask | None = None) -> Float32:
+    """Grey values of one image with the 1st percentile at 0 and the 99th at 1, cut off outside.
 
-    An image without contrast comes out as zeros.
+    Percentiles are those of the `WINDOW` pixels about the middle, as many as training images have,
+    where ``known``. An image without contrast comes out as zeros.
     """
-    low, high = np.percentile(images[..., ::4], [1, 99])
-    scaled = (images - low) / max(float(high - low), 1e-6)
+    middle = tuple(
+        slice(max(0, (side - WINDOW) // 2), (side + WINDOW) // 2) for side in image.shape
+    )
+    return _scaled(image, *_limits(image[middle], None if known is None else known[middle]))
+
+
+def normalise_locally(image: Float32, known: Mask) -> Float32:
+    """Like `normalise`, but every part of a large image by the percentiles of its surroundings.
+
+    Over a whole field the fat beside the coils, or the air around a small patient, would decide
+    how bright the heart is; training images show no more than `WINDOW` pixels about it.
+    """
+    rows, columns = (_window_starts(side) for side in image.shape)
+    limits = np.empty((len(rows), len(columns), 2), np.float32)
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            window = slice(row, row + WINDOW), slice(column, column + WINDOW)
+            limits[i, j] = _limits(image[window], known[window])
+    down, across = (
+        np.interp(np.arange(side), np.add(starts, WINDOW / 2), np.arange(len(starts)))
+        for side, starts in zip(image.shape, (rows, columns), strict=True)
+    )
+    x, y = np.meshgrid(across.astype(np.float32), down.astype(np.float32))
+    low, high = (cv2.remap(limits[..., k], x, y, cv2.INTER_LINEAR) for k in (0, 1))
+    return _scaled(image, low, high)
+
+
+def _window_starts(side: int) -> list[int]:
+    """First pixels of windows that cover a side, each overlapping the next by half or more."""
+    count = 1 + max(0, -(-(side - WINDOW) // (WINDOW // 2)))
+    return [round(start) for start in np.linspace(0, max(0, side - WINDOW), count)]
+
+
+def _limits(image: Float32, known: Mask | None) -> tuple[float, float]:
+    # Every fourth pixel in a row gives the percentiles to well under a grey level.
+    values = image[:, ::4] if known is None else image[:, ::4][known[:, ::4]]
+    low, high = np.percentile(values, [1, 99]) if values.size else (0.0, 0.0)
+    return float(low), float(high)
+
+
+def _scaled(image: Float32, low: float | Float32, high: float | Float32) -> Float32:
+    scaled = (image - low) / np.maximum(np.subtract(high, low), 1e-6)
     return np.asarray(np.clip(scaled, -0.2, 1.6), np.float32)
 
 
@@ -90,20 +134,11 @@ def neighbour_steps(slice_step_mm: float) -> int:
     return max(1, round(NEIGHBOUR_MM / slice_step_mm))
 
 
-def with_neighbours(images: Float32, step: int) -> Float32:
-    """Stack each slice with its neighbours; where the stack ends, the slice stands in for one.
+def neighbours(number: int, step: int, last: int) -> tuple[int, int, int]:
+    """Slices that are shown for one: ``step`` before it, itself, ``step`` after it.
 
-    Parameters
-    ----------
-    images
-        ``(slice, row, column)`` from the apex to the base.
-
-    Returns
-    -------
-    (slice, 3, row, column) array
-        What `predict` takes.
+    Where the stack ends, after slice ``last``, the slice stands in for the missing one.
     """
-    number = np.arange(len(images))
-    below = np.where(number - step >= 0, number - step, number)
-    above = np.where(number + step < len(images), number + step, number)
-    return np.stack([images[below], images, images[above]], axis=1)
+    before = number - step if number - step >= 0 else number
+    after = number + step if number + step <= last else number
+    return before, number, after

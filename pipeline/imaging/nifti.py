@@ -16,6 +16,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
+from pipeline.imaging.long_axis_series import LongAxis
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -92,6 +93,38 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         float(own_rr_ms.mean()) / 1000,
     )
     return Stack(cine, triggers, own_rr_ms, source, ())
+
+
+def read_nifti_views(folder: Path) -> tuple[LongAxis, ...]:
+    """Long-axis views ``<name>.nii.gz`` of a folder, each with ``<name>_timing.json`` beside it.
+
+    Raises
+    ------
+    InputError
+        When a file is not a readable 4D image of one slice, or has no usable timing.
+    """
+    paths = [*folder.glob("*.nii"), *folder.glob("*.nii.gz")] if folder.is_dir() else []
+    return tuple(_read_view(path) for path in sorted(paths))
+
+
+def _read_view(path: Path) -> LongAxis:
+    name = path.name.removesuffix(".gz").removesuffix(".nii")
+    image = _load(path)
+    if len(image.shape) != 4 or image.shape[2] != 1 or image.shape[3] < MIN_PHASES:
+        raise InputError(
+            f"{path}: is no long-axis view, its shape is {image.shape}; one slice of "
+            f"{MIN_PHASES} phases or more is needed (columns, rows, 1, phases); take other files "
+            "out of this folder"
+        )
+    intensity, mr_from_index = read_image(path)
+    timing = path.with_name(f"{name}_timing.json")
+    if timing.exists():
+        triggers, rr_ms = _timing_file(timing, len(intensity), 1)
+    else:
+        triggers, rr_ms = _header_timing(image, path, len(intensity), 1)
+    phases = common_phases(triggers, rr_ms, str(timing if timing.exists() else path))
+    pixels = np.ascontiguousarray(intensity, np.float32)
+    return LongAxis(name, Cine(pixels, mr_from_index, phases, float(rr_ms[0]) / 1000))
 
 
 def _load(path: Path) -> Any:

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from pipeline.errors import InputError, StageError
-from pipeline.geometry import Float, Float32, Label
+from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cleanup import clean_probability
+from pipeline.imaging.cleanup import clean_cycle
+from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
     label_probability,
-    locate_heart,
 )
 from pipeline.imaging.interpolation import isotropic_labels
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.locating import locate_heart
+from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.settings import SegmentSettings
-from pipeline.imaging.view import PIXEL_MM, View
+from pipeline.imaging.view import PIXEL_MM, Orientation, View
 
 Progress = Callable[[int, int], None]
 
-LEAST_CUT = 0.25
-"""A slice with less than this share of the largest cut through the heart is judged by the heart's
-outline over all slices: where a slice grazes the tip, its few pixels are doubtful by nature."""
+LARGEST_BARE = 0.5
+"""Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""
 
 LEAST_SHARE = 0.2
 """A slice with less than this share of the heart that both its neighbours show has lost it."""
@@ -47,16 +49,23 @@ class Segmentation:
     """4x4: ``(x, y, z)`` indices of ``heart`` to LPS mm."""
 
     confidence: Float
-    """``(phase, z)`` in [0, 1]: mean probability of the labels chosen within the heart; where a
-    slice shows little of it, within the heart's outline over all slices."""
+    """``(phase, z)`` in [0, 1] (`pipeline.imaging.confidence.slice_confidence`)."""
+
+    orientation: Orientation
+    """How the heart was found to lie, against what the file says. All products are in the file's
+    frame, whichever it is."""
 
 
 def segment_cine(
-    cine: Cine, settings: SegmentSettings, progress: Progress | None = None
+    cine: Cine,
+    settings: SegmentSettings,
+    progress: Progress | None = None,
+    views: Sequence[Cine] = (),
 ) -> Segmentation:
     """Label cavities, muscle, atria and aorta by a network trained on synthetic images alone.
 
-    ``progress`` is told of the phases done.
+    ``progress`` is told of the phases done; ``views`` are long-axis views, a slice each, by which
+    breath-hold shifts are found.
 
     Raises
     ------
@@ -66,38 +75,26 @@ def segment_cine(
         When no heart is found, or a slice is not understood; slice and phase are named.
     """
     _require_finite(cine)
-    found = label_probability(cine, locate_heart(cine), progress)
+    _require_contrast(cine)
+    place = locate_heart(cine)
+    found = label_probability(cine, place.view, settings.most_views, progress)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
     seen = _drawn(found)
-    confidence = slice_confidence(found, seen)
+    _require_ring(seen, found.view)
+    confidence = slice_confidence(cine, found, seen)
     _require_understood(seen, confidence, found.view, settings)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
-    for phase, probability in enumerate(found.value):
-        found.value[phase] = clean_probability(probability)
+    clean_cycle(found.value)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
-    heart, heart_mr_from_index = _isotropic(found, drawn, settings)
+    crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
+    acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
+    heart, heart_mr_from_index = _isotropic(found, drawn, settings, crossings, acquired)
     labels = _on_cine(found, cine)
     stored = np.argsort(found.view.order)
-    return Segmentation(labels, heart, heart_mr_from_index, confidence[:, stored])
-
-
-def slice_confidence(found: PlaneProbability, drawn: Label) -> Float:
-    """Mean probability of the labels chosen, ``(phase, slice)``, apex first.
-
-    Over a slice's own heart, or, where it shows little of it, over the outline that the heart has
-    in any slice of that phase: a slice beside the heart is understood if it is known as such.
-    """
-    confidence = np.empty(drawn.shape[:2])
-    for phase, labels in enumerate(drawn):
-        certainty = found.at_slices(phase).max(axis=1)
-        outline = (labels > 0).any(axis=0)
-        least = LEAST_CUT * (labels > 0).sum(axis=(1, 2)).max()
-        for number, cut in enumerate(labels):
-            mask = cut > 0
-            region = mask if mask.sum() >= max(least, 1) else outline
-            confidence[phase, number] = certainty[number][region].mean() if region.any() else 0.0
-    return confidence
+    return Segmentation(
+        labels, heart, heart_mr_from_index, confidence[:, stored], place.orientation
+    )
 
 
 def _require_finite(cine: Cine) -> None:
@@ -107,6 +104,16 @@ def _require_finite(cine: Cine) -> None:
         raise InputError(
             f"cine, phase {phase}, slice {number}: grey values must be finite numbers, got NaN or "
             "infinity; export the images again"
+        )
+
+
+def _require_contrast(cine: Cine) -> None:
+    blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
+    if blank.any():
+        phase, number = np.argwhere(blank)[0]
+        raise StageError(
+            f"phase {phase}, slice {number}: no heart found: all its pixels are alike; export the "
+            "images again, or leave the slice out"
         )
 
 
@@ -138,6 +145,22 @@ def _require_understood(
         )
 
 
+def _require_ring(drawn: Label, view: View) -> None:
+    """Refuse what has no left ventricle: a cavity that lies in its muscle or by other chambers."""
+    cavity = drawn == LABELS["lv_cavity"]
+    cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)[None, None]
+    border = ndimage.binary_dilation(cavity, cross) & ~cavity
+    bare = (border & (drawn == 0)).sum(axis=(1, 2, 3)) / np.maximum(border.sum(axis=(1, 2, 3)), 1)
+    bare[~cavity.any(axis=(1, 2, 3))] = 1.0
+    if bare.max() > LARGEST_BARE:
+        raise StageError(
+            f"phase {bare.argmax()}, slices 0 to {len(view.order) - 1}: no heart found: of what "
+            f"looks like the left ventricle's cavity, {100 * bare.max():.0f} % of the border has "
+            f"no heart muscle, at most {100 * LARGEST_BARE:.0f} % were expected; check that the "
+            "study is a cardiac cine (`inspect`), and leave series of other parts of the body out"
+        )
+
+
 def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> None:
     """Refuse a phase that shows no left ventricle to speak of."""
     ventricle = (drawn == LABELS["lv_cavity"]) | (drawn == LABELS["lv_myocardium"])
@@ -152,26 +175,56 @@ def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> N
 
 
 def _isotropic(
-    found: PlaneProbability, drawn: Label, settings: SegmentSettings
+    found: PlaneProbability,
+    drawn: Label,
+    settings: SegmentSettings,
+    crossings: Crossings,
+    acquired: Integer,
 ) -> tuple[Label, Float]:
-    """The heart on an isotropic grid along the view's axes, and that grid's place."""
+    """The heart on an isotropic grid along the view's axes, and that grid's place.
+
+    ``acquired`` are the slices, counted from the apex, that hold more than their neighbours' mean.
+    """
     view = found.view
-    shifts_mm = np.zeros((len(view.order), 2))
+    heights_mm = view.slice_step_mm * np.asarray(acquired, float)
+    shifts_mm = np.zeros((len(acquired), 2))
     if settings.correct_shifts:
-        shifts_mm = slice_shifts_mm(drawn, PIXEL_MM, view.slice_step_mm, view.axes)
+        seen = drawn[:, acquired]
+        shifts_mm = slice_shifts_mm(seen, PIXEL_MM, heights_mm, view.axes, crossings)
+    count = found.planes_a_slice
+    planes = (count * acquired[:, None] + np.arange(count)).ravel()
     volume, first_mm = isotropic_labels(
-        found.value,
+        found.value if len(acquired) == len(view.order) else found.value[:, planes],
         PIXEL_MM,
-        found.plane_mm,
-        np.repeat(shifts_mm, found.planes_a_slice, axis=0),
-        view.slice_step_mm,
+        found.plane_mm[planes],
+        np.repeat(shifts_mm, count, axis=0),
+        # What lies beyond the outer slices is theirs to half a step, planes between included.
+        view.slice_step_mm / 2 + found.plane_mm[0],
         settings.grid_mm,
         settings.margin_mm,
     )
+    volume, added = _with_margin(volume, round(settings.margin_mm / settings.grid_mm))
+    first_mm = first_mm - (0, 0, added * settings.grid_mm)
+    axes, corner_mm = view.axes, view.corner_mm + first_mm @ view.axes
+    if np.linalg.det(axes) < 0:
+        # Seen mirrored; stored unmirrored, since readers of surfaces count on right-handed grids.
+        volume = np.ascontiguousarray(volume[..., ::-1])
+        corner_mm = corner_mm + (volume.shape[-1] - 1) * settings.grid_mm * axes[0]
+        axes = np.stack([-axes[0], axes[1], axes[2]])
     mr_from_index = np.eye(4)
-    mr_from_index[:3, :3] = view.axes.T * settings.grid_mm
-    mr_from_index[:3, 3] = view.corner_mm + first_mm @ view.axes
+    mr_from_index[:3, :3] = axes.T * settings.grid_mm
+    mr_from_index[:3, 3] = corner_mm
     return volume, mr_from_index
+
+
+def _with_margin(volume: Label, margin: int) -> tuple[Label, int]:
+    """Empty planes added where the heart reaches the stack's ends, and how many in front."""
+    found = np.flatnonzero(volume.any(axis=(0, 2, 3)))
+    if not len(found):
+        return volume, 0
+    before = max(0, margin - int(found[0]))
+    after = max(0, margin - (volume.shape[1] - 1 - int(found[-1])))
+    return np.pad(volume, ((0, 0), (before, after), (0, 0), (0, 0))), before
 
 
 def _on_cine(found: PlaneProbability, cine: Cine) -> Label:

@@ -10,12 +10,16 @@ class SegmentSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    most_views: int = Field(5, ge=1, le=5)
+    """In how many ways, each turned a little otherwise, the network is shown each image; the more
+    images a study has, the fewer, so that the time stays about the same."""
+
     phase_blend: float = Field(0.15, ge=0, le=1 / 3)
     """Share that each neighbouring phase has in a phase's probabilities at 25 phases a beat; with
     fewer, the share falls as the square of their distance grows, as does what it blurs."""
 
-    min_confidence: float = Field(0.6, ge=0, le=1)
-    """Below this mean probability of the label chosen, a slice counts as not understood."""
+    min_confidence: float = Field(0.5, ge=0, le=1)
+    """An image whose labels are trusted less counts as not understood and fails the stage."""
 
     min_ventricle_ml: float = Field(30.0, gt=0)
     """A left ventricle (cavity and muscle) smaller than this counts as not found."""

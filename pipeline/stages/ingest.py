@@ -6,31 +6,38 @@ from typing import Any
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Stack
-from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import read_ecg
-from pipeline.imaging.nifti import read_nifti_cine
+from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.job import Job
 from pipeline.products import write_cine
 
 
 def run(job: Job) -> dict[str, Any]:
-    """Read the cine, DICOM or NIfTI, and write ``cine.nii.gz`` and ``phases.json``."""
+    """Read the cine, DICOM or NIfTI, and write ``cine.nii.gz`` and ``phases.json``.
+
+    Long-axis views are kept beside it: those in the folder of DICOM files, or, with a cine in
+    NIfTI, those in the study's folder ``long_axis``.
+    """
     files = job.study.cine
     if files.path.is_dir():
-        stack = read_dicom_cine(files.path, files.rr_ms)
+        stack, views = read_dicom_study(files.path, files.rr_ms, files.fill_gaps)
     else:
         stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
+        views = read_nifti_views(job.study.long_axis)
     _require_ecg_as_long(job, stack)
-    write_cine(job.folder, stack)
+    write_cine(job.folder, stack, views)
     cine = stack.cine
     return {
         "phases": len(cine.phases),
         "slices": cine.intensity.shape[1],
+        "interpolated_slices": list(cine.interpolated),
         "matrix": list(cine.intensity.shape[2:]),
         "spacing_mm": [round(float(value), 4) for value in cine.spacing_mm],
         "rr_s": round(cine.rr_s, 4),
         "timing_source": stack.timing_source,
         "left_out": list(stack.left_out),
+        "long_axis": [view.name for view in views],
     }
 
 

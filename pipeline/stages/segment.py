@@ -9,13 +9,14 @@ import numpy as np
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.job import Job
-from pipeline.products import read_cine, write_labels, write_table
+from pipeline.products import read_cine, read_long_axis, write_labels, write_table
 
 
 def run(job: Job) -> dict[str, Any]:
     """Write labels on the cine's own slices and the same heart on an isotropic grid."""
     cine = read_cine(job.products / "ingest")
-    found = segment_cine(cine, job.settings.segment, job.progress)
+    views = [view.cine for view in read_long_axis(job.products / "ingest")]
+    found = segment_cine(cine, job.settings.segment, job.progress, views)
     write_labels(job.folder, "labels", found.labels, cine.mr_from_index)
     write_labels(job.folder, "heart", found.heart, found.heart_mr_from_index)
     write_table(job.folder / "labels.json", LABELS)
@@ -29,4 +30,8 @@ def run(job: Job) -> dict[str, Any]:
         for name, value in LABELS.items()
     }
     confidence = found.confidence[np.isfinite(found.confidence)]
-    return {"lowest_confidence": round(float(confidence.min()), 3), "volumes_ml": volumes}
+    return {
+        "lowest_confidence": round(float(confidence.min()), 3),
+        "orientation": str(found.orientation),
+        "volumes_ml": volumes,
+    }

@@ -1,0 +1,88 @@
+"""Which images beside the stack are long-axis views, and their place and time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine
+from pipeline.imaging.frames import MIN_PHASES, ORIGINAL, PARALLEL_COSINE, Frame
+
+LEAST_ANGLE_DEG = 45.0
+"""A long-axis view is turned at least this far from the stack's slices."""
+
+
+@dataclass(frozen=True, slots=True)
+class LongAxis:
+    """One long-axis view: a slice through the heartbeat, across those of the stack."""
+
+    name: str
+    """Series, or file, that it comes from."""
+
+    cine: Cine
+    """One slice; its phases are those of its own trigger times and RR interval."""
+
+
+def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...]:
+    """The long-axis views among a scanner's images.
+
+    Original images of one slice at `MIN_PHASES` moments or more, with trigger times within their
+    RR interval, at least `LEAST_ANGLE_DEG` from the stack's slices, and in the same frame of
+    reference: a patient laid down anew is somewhere else. Localisers and images of one moment are
+    none. Parallel slices are views each, for each has a breath-hold of its own.
+    """
+    frames = list(frames)
+    normal = np.cross(stack.mr_from_index[:3, 0], stack.mr_from_index[:3, 1])
+    normal /= np.linalg.norm(normal)
+    reference = _reference(frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE)
+    slices: dict[tuple[float, ...], list[Frame]] = {}
+    for frame in sorted(frames, key=lambda one: one.where):
+        across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
+        if across and frame.kind == ORIGINAL and frame.frame_of_reference in ("", reference):
+            slices.setdefault(_place(frame), []).append(frame)
+    found = (_view(one) for one in slices.values())
+    return tuple(view for view in found if view is not None)
+
+
+def _cosine(frame: Frame, normal: np.typing.NDArray[np.float64]) -> float:
+    return abs(float(frame.normal @ normal))
+
+
+def _reference(frames: Iterable[Frame]) -> str:
+    counted = Counter(frame.frame_of_reference for frame in frames)
+    return max(counted, key=lambda uid: (counted[uid], uid), default="")
+
+
+def _place(frame: Frame) -> tuple[float, ...]:
+    """The same for all images of one slice on one matrix."""
+    place = np.concatenate([frame.position_mm.round(1), frame.axes.ravel().round(3)])
+    return (*frame.pixels.shape, *np.round(frame.spacing_mm, 3), *(place + 0.0))
+
+
+def _view(frames: Sequence[Frame]) -> LongAxis | None:
+    """The images of one slice in order of time; None when they are no cine."""
+    first = frames[0]
+    timed = [frame for frame in frames if frame.times_ms and frame.rr_ms is not None]
+    names = [name for name in first.times_ms if all(name in one.times_ms for one in timed)]
+    if len(timed) < len(frames) or not names:
+        return None
+    moments = {frame.times_ms[names[0]]: frame for frame in reversed(timed)}
+    ordered = [moments[time_ms] for time_ms in sorted(moments)]
+    rr_ms = float(np.mean([frame.rr_ms for frame in ordered if frame.rr_ms is not None]))
+    low_s, high_s = PLAUSIBLE_RR_S
+    phases = np.array([frame.times_ms[names[0]] for frame in ordered]) / rr_ms
+    rising = all(later > earlier for earlier, later in pairwise(phases))
+    inside = phases[0] >= 0 and phases[-1] < 1 and low_s < rr_ms / 1000 < high_s
+    if len(ordered) < MIN_PHASES or not rising or not inside:
+        return None
+    mr_from_index = np.eye(4)
+    mr_from_index[:3, 0] = first.axes[0] * first.spacing_mm[0]
+    mr_from_index[:3, 1] = first.axes[1] * first.spacing_mm[1]
+    mr_from_index[:3, 2] = first.normal
+    mr_from_index[:3, 3] = first.position_mm
+    intensity = np.stack([np.asarray(frame.pixels, np.float32) for frame in ordered])[:, None]
+    return LongAxis(first.series, Cine(intensity, mr_from_index, phases, rr_ms / 1000))

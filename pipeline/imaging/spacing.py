@@ -1,0 +1,92 @@
+"""Even spacing of a stack: checked, and restored where single slices are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float, Float32, Integer
+from pipeline.imaging.frames import Frame
+
+WIDEST_GAP_MM = 25.0
+"""Across a wider gap nothing is interpolated: an apex or a valve plane would fit in it."""
+
+
+def regular_steps(
+    slices: Sequence[Sequence[Frame]], where: str, fill: bool
+) -> tuple[Float, Integer]:
+    """The step of an evenly spaced stack, of which single slices may be missing.
+
+    Parameters
+    ----------
+    slices
+        Images by slice, in order along the normal.
+    where
+        What they were read from, for messages.
+    fill
+        Whether single slices may be missing.
+
+    Returns
+    -------
+    step_mm, numbers
+        ``(3,)`` LPS from one slice to the next, and ``(slice,)`` the place of each in the stack.
+
+    Raises
+    ------
+    InputError
+        When slices are unevenly spaced or shifted sideways, or one is missing: always where it
+        may not be, else where a gap is wider than one slice or than `WIDEST_GAP_MM`.
+    """
+    positions_mm = np.array([one[0].position_mm for one in slices])
+    lengths_mm = np.diff(positions_mm, axis=0) @ slices[0][0].normal
+    usual_mm = float(lengths_mm.min())
+    counts = np.maximum(np.rint(lengths_mm / usual_mm), 1).astype(int)
+    numbers = np.concatenate([[0], np.cumsum(counts)])
+    step_mm = (positions_mm[-1] - positions_mm[0]) / numbers[-1]
+    off_mm = np.abs(positions_mm - positions_mm[0] - numbers[:, None] * step_mm).max()
+    if off_mm > max(0.1, 0.02 * usual_mm):
+        raise InputError(
+            f"{where}: slices have different spacing: steps along the normal are "
+            f"{lengths_mm.round(2).tolist()} mm, or the slices are shifted sideways by "
+            f"{off_mm:.2f} mm; an evenly spaced stack is needed"
+        )
+    too_wide = (counts > 2) | (lengths_mm > WIDEST_GAP_MM) if fill else True
+    wide = np.flatnonzero((counts > 1) & too_wide)
+    if len(wide):
+        first = wide[0]
+        raise InputError(
+            f"{where}: missing slice between {slices[first][0].where} and "
+            f"{slices[first + 1][0].where}: {lengths_mm[first]:.2f} mm apart, the others are "
+            f"{usual_mm:.2f} mm apart; add the missing slice, or, where it is one in at most "
+            f"{WIDEST_GAP_MM:g} mm, let its neighbours stand in for it: cine.fill_gaps: true in "
+            "study.yaml"
+        )
+    return np.asarray(step_mm), np.asarray(numbers, np.int64)
+
+
+def fill_gaps(intensity: Float32, numbers: Integer) -> tuple[Float32, tuple[int, ...]]:
+    """Put the mean of both neighbours where a slice is missing.
+
+    Parameters
+    ----------
+    intensity
+        ``(phase, slice, row, column)`` of the slices that are there.
+    numbers
+        ``(slice,)`` their places in the stack, rising; no two neighbours are missing.
+
+    Returns
+    -------
+    intensity, missing
+        Of the whole stack, and the numbers of the slices filled in.
+    """
+    count = int(numbers[-1]) + 1
+    if count == len(numbers):
+        return intensity, ()
+    filled = np.empty((len(intensity), count, *intensity.shape[2:]), np.float32)
+    filled[:, numbers] = intensity
+    missing = sorted(set(range(count)) - set(numbers.tolist()))
+    for number in missing:
+        filled[:, number] = (filled[:, number - 1] + filled[:, number + 1]) / 2
+    return filled, tuple(missing)

@@ -1,0 +1,110 @@
+"""Anatomy put right: what is cut off, bridged, closed and smoothed, and what must stay."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from pipeline.imaging.cleanup import clean_cycle, clean_probability, ventricle_tip
+
+SIDE, PIXEL_MM = 64, 1.5
+CAVITY, MUSCLE, RV, ATRIUM = 1, 2, 3, 4
+Y, X = np.mgrid[:SIDE, :SIDE]
+RADIUS = np.hypot(X - 32, Y - 32)
+
+
+def one_hot(labels):
+    """Probabilities that are certain enough of these labels: ``(..., class, row, column)``."""
+    return np.moveaxis(np.eye(7, dtype=np.float32)[labels], -1, -3) * 0.9 + 0.1 / 7
+
+
+def ring(inner=14, outer=22):
+    return np.where(inner > RADIUS, CAVITY, np.where(outer > RADIUS, MUSCLE, 0))
+
+
+def cleaned(labels):
+    return clean_probability(one_hot(labels), pixel_mm=PIXEL_MM).argmax(axis=1)
+
+
+def test_a_heart_without_faults_is_left_as_it_is():
+    heart = np.stack([ring(8 + 2 * k, 16 + 2 * k) for k in range(5)])
+    heart[:, 20:44, 50:60] = np.where(heart[:, 20:44, 50:60] == 0, RV, heart[:, 20:44, 50:60])
+    np.testing.assert_array_equal(cleaned(heart), heart)
+
+
+def test_papillary_muscles_are_drawn_inside_the_cavity():
+    smooth = np.stack([ring()] * 3)
+    heart = smooth.copy()
+    # One stands free in the blood, one hangs on the wall.
+    heart[:, np.hypot(X - 28, Y - 30) < 3] = MUSCLE
+    heart[:, np.hypot(X - 44, Y - 34) < 4] = MUSCLE
+    found = cleaned(heart)
+    # A disc of 10 pixels rolled along a circle of 14 reaches into a notch 8 wide by its sag.
+    assert (found != smooth).mean(axis=(1, 2)).max() * SIDE**2 < 12
+    assert not (found[:, np.hypot(X - 28, Y - 30) < 3] == MUSCLE).any()
+
+
+def test_a_septum_that_bows_inwards_stays_muscle():
+    heart = np.stack([ring()] * 3)
+    bowed = np.hypot(X - 56, Y - 32) < 18
+    heart[:, bowed & (RADIUS < 14)] = MUSCLE
+    # The bow has a radius of 27 mm, more than the 15 mm of the disc; only its two ends are
+    # corners, which a lattice rounds by a pixel or two.
+    changed = (cleaned(heart) != heart).sum(axis=(1, 2))
+    assert changed.max() < 10
+
+
+def test_smoothing_never_thins_a_wall_below_three_millimetres():
+    heart = np.stack([ring(14, 17)] * 3)
+    heart[:, (np.abs(X - 46) < 3) & (np.abs(Y - 32) < 2) & (RADIUS < 17)] = MUSCLE
+    for plane in cleaned(heart):
+        ventricle = (plane == CAVITY) | (plane == MUSCLE)
+        to_outside = distance_transform_edt(ventricle)[(plane == CAVITY) & (heart[0] == MUSCLE)]
+        assert (to_outside * PIXEL_MM > 3.0).all()
+
+
+def test_a_gap_in_the_ring_is_closed_where_muscle_surrounds_the_rest():
+    heart = np.stack([ring()] * 3)
+    heart[:, (X > 32) & (np.abs(Y - 32) < 5) & (RADIUS >= 14)] = 0
+    found = cleaned(heart)
+    for plane in found:
+        beside = (RADIUS >= 14) & (RADIUS < 15)
+        assert (plane[beside] == MUSCLE).all()
+
+
+def test_a_ring_that_opens_into_the_atrium_stays_open():
+    heart = np.stack([ring()] * 3)
+    mouth = (X > 32) & (np.abs(Y - 32) < 5) & (RADIUS >= 14) & (RADIUS < 24)
+    heart[:, mouth] = ATRIUM
+    np.testing.assert_array_equal(cleaned(heart)[:, mouth], ATRIUM)
+
+
+def test_muscle_without_cavity_between_two_rings_gets_the_cavity_that_both_share():
+    whole = np.stack([ring(10), ring(14), ring(12)])
+    heart = whole.copy()
+    heart[1][RADIUS < 14] = MUSCLE
+    found = cleaned(heart)
+    np.testing.assert_array_equal(found[1] == CAVITY, RADIUS < 10)
+    np.testing.assert_array_equal(found[[0, 2]], whole[[0, 2]])
+
+
+def test_the_tip_is_the_same_in_every_phase():
+    """Fat about the tip taken for muscle in two phases of three is cut off in all, or in none."""
+    tapering = np.stack([ring(2 + 3 * k, 8 + 3 * k) for k in range(5)])
+    fat = tapering.copy()
+    fat[0] = np.where(RADIUS < 20, MUSCLE, 0)
+    value = one_hot(np.stack([fat, tapering, fat]))
+    assert ventricle_tip(value) == 1
+    clean_cycle(value, PIXEL_MM)
+    ventricle = np.isin(value.argmax(axis=2), (CAVITY, MUSCLE))
+    assert not ventricle[:, 0].any()
+    assert ventricle[:, 1:].any(axis=(2, 3)).all()
+
+
+@pytest.mark.parametrize("phases", [1, 3])
+def test_probabilities_still_sum_to_one(phases):
+    rng = np.random.default_rng(0)
+    value = np.moveaxis(rng.dirichlet(np.ones(7) / 3, (phases, 4, SIDE, SIDE)), -1, 2)
+    value = value.astype(np.float32)
+    clean_cycle(value)
+    np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-4)
+    assert value.min() >= 0

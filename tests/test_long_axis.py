@@ -1,0 +1,250 @@
+"""Long-axis views: which images they are, and what they tell of breath-holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cine_files import PHASES, RR_MS, dicom_frame, in_series, write_dicom
+
+from pipeline.errors import InputError
+from pipeline.imaging.alignment import slice_shifts_mm
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.dicom import read_dicom_study
+from pipeline.imaging.long_axis import NO_CROSSINGS, find_crossings
+from pipeline.imaging.nifti import read_nifti_views, write_image
+from pipeline.imaging.view import PIXEL_MM, view_of
+from pipeline.products import read_long_axis, write_cine
+
+ACROSS = [0, 1, 0, 0, 0, -1]  # 37 degrees from the stack's rows, its slices seen from the side
+LEANING = [0.8, 0.6, 0.0, -0.3, 0.4, -np.sqrt(0.75)]  # 30 degrees off the stack's own plane
+
+
+def add_view(folder: Path, number: int, moments: int = PHASES, **changes: Any) -> None:
+    for phase in range(moments):
+        data = in_series(dicom_frame(0, phase), 50 + number, f"view {number}")
+        data.ImageOrientationPatient = ACROSS
+        data.NominalInterval = 1000
+        for name, value in changes.items():
+            setattr(data, name, value)
+        data.save_as(folder / f"view_{number}_{phase}.dcm")
+
+
+def in_frame(uid: str) -> Any:
+    def change(data: Any, number: int, phase: int) -> bool:
+        data.FrameOfReferenceUID = uid
+        return True
+
+    return change
+
+
+def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path: Path) -> None:
+    write_dicom(tmp_path, in_frame("1.2.3"))
+    add_view(tmp_path, 0, FrameOfReferenceUID="1.2.3")
+    add_view(tmp_path, 1, FrameOfReferenceUID="1.2.4")
+    add_view(tmp_path, 2, moments=1, FrameOfReferenceUID="1.2.3", ImagePositionPatient=[9, 9, 9])
+    add_view(tmp_path, 3, FrameOfReferenceUID="1.2.3", ImageOrientationPatient=LEANING)
+    add_view(tmp_path, 4, ImageType=["DERIVED", "SECONDARY"], FrameOfReferenceUID="1.2.3")
+    stack, views = read_dicom_study(tmp_path)
+    assert [view.name for view in views] == ['series 50 "view 0"']
+    view = views[0].cine
+    assert view.intensity.shape == (PHASES, 1, *stack.cine.intensity.shape[2:])
+    # Its own RR interval is 1000 ms; the stack's is another.
+    np.testing.assert_allclose(view.phases, np.arange(PHASES) * RR_MS / PHASES / 1000)
+    assert view.rr_s == 1.0
+    np.testing.assert_allclose(view.mr_from_index[:3, 0], [0, 1.25, 0], atol=1e-9)
+    assert len(stack.left_out) == 5
+
+
+def test_views_written_then_read_are_the_same(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "cine")
+    add_view(tmp_path / "cine", 0)
+    stack, views = read_dicom_study(tmp_path / "cine")
+    write_cine(tmp_path, stack, views)
+    (again,) = read_long_axis(tmp_path)
+    assert again.name == views[0].name
+    np.testing.assert_array_equal(again.cine.intensity, views[0].cine.intensity)
+    np.testing.assert_allclose(again.cine.mr_from_index, views[0].cine.mr_from_index, atol=1e-6)
+    np.testing.assert_array_equal(again.cine.phases, views[0].cine.phases)
+
+
+def test_views_in_nifti_have_their_own_timing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 99, (3, 1, 6, 7)).astype(np.int16)
+    write_image(tmp_path / "two_chamber.nii.gz", images, np.eye(4))
+    timing = '{"trigger_times_ms": [[0, 200, 500]], "rr_ms": [1000]}'
+    (tmp_path / "two_chamber_timing.json").write_text(timing)
+    (view,) = read_nifti_views(tmp_path)
+    assert view.name == "two_chamber"
+    np.testing.assert_array_equal(view.cine.intensity, images)
+    np.testing.assert_allclose(view.cine.phases, [0, 0.2, 0.5])
+    write_image(tmp_path / "stack.nii.gz", np.zeros((3, 4, 6, 7), np.int16), np.eye(4))
+    with pytest.raises(InputError, match=r"stack\.nii\.gz: is no long-axis view"):
+        read_nifti_views(tmp_path)
+    assert read_nifti_views(tmp_path / "none") == ()
+
+
+SLICES, SIDE, SPACING_MM, MOMENTS = 9, 64, 2.0, 4
+BREATH_MM = (0.6, 2.2)
+"""Breath-holds differ along head and feet above all: here along the stack's rows."""
+
+TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""The body's y axis runs to the patient's feet."""
+
+
+class Body:
+    """Grey values known everywhere: a beating sum of Gaussians, no two places alike."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.centres_mm = rng.uniform((-45, -45, -10), (45, 45, 90), (60, 3))
+        self.widths_mm = rng.uniform(7, 14, 60)
+        self.heights = rng.uniform(-1, 1, 60)
+        self.swing_mm = rng.normal(0, 2, (60, 3))
+
+    def seen(self, points_mm: Any, phase: float) -> Any:
+        centres_mm = self.centres_mm + np.sin(2 * np.pi * phase) * self.swing_mm
+        total = np.zeros(points_mm.shape[:-1])
+        for centre, width, height in zip(centres_mm, self.widths_mm, self.heights, strict=True):
+            squares = np.square(points_mm - centre).sum(axis=-1)
+            total += height * np.exp(-squares / (2 * width**2))
+        return total
+
+
+def image_of(body: Body, frame: Any, moved_mm: Any, noise: float, rng: Any) -> Any:
+    """Images ``(phase, row, column)`` of a body displaced by ``moved_mm``."""
+    y, x = np.mgrid[:SIDE, :SIDE]
+    points_mm = x[..., None] * frame[:3, 0] + y[..., None] * frame[:3, 1] + frame[:3, 3] - moved_mm
+    images = np.stack([body.seen(points_mm, k / MOMENTS) for k in range(MOMENTS)])
+    return images + noise * rng.standard_normal(images.shape)
+
+
+def frame_of(columns: Any, rows: Any, middle_mm: Any, step_mm: float) -> Any:
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([columns, rows, np.cross(columns, rows)], axis=1)
+    frame[:3, :2] *= SPACING_MM
+    frame[:3, 2] *= step_mm
+    frame[:3, 3] = middle_mm - (SIDE - 1) / 2 * frame[:3, :2].sum(axis=1)
+    return frame
+
+
+def turned(frame: Any) -> Any:
+    lying = np.eye(4)
+    lying[:3, :3] = TURN
+    return lying @ frame
+
+
+def stack_and_views(seed: int, noise: float = 0.05) -> Any:
+    """A stack and three views of one body, each image displaced in its own way."""
+    rng = np.random.default_rng([seed, 1])
+    body, phases = Body(seed), np.arange(MOMENTS) / MOMENTS
+    frame = frame_of(*np.eye(3)[:2], np.zeros(3), 10.0)
+    slices_mm = np.pad(rng.normal(0, BREATH_MM, (SLICES, 2)), ((0, 0), (0, 1)))
+    stack = [
+        image_of(body, frame + np.outer([0, 0, 10.0 * z, 0], [0, 0, 0, 1]), moved, noise, rng)
+        for z, moved in enumerate(slices_mm)
+    ]
+    intensity = np.stack(stack, axis=1).astype(np.float32)
+    cine = Cine(intensity, turned(frame), phases, 0.8)
+    views, views_mm = [], np.pad(rng.normal(0, BREATH_MM, (3, 2)), ((0, 0), (0, 1)))
+    for angle, moved in zip(np.radians([10, 70, 130]), views_mm, strict=True):
+        across = np.array([np.cos(angle), np.sin(angle), 0])
+        own = frame_of(across, np.array([0, 0, 1.0]), np.array([0, 0, 40.0]), 1.0)
+        # Another gain and offset: nothing but the pattern is compared.
+        image = 3 * image_of(body, own, moved, noise, rng) + 7
+        views.append(Cine(image[:, None].astype(np.float32), turned(own), phases, 0.9))
+    return cine, views, slices_mm[:, :2], views_mm[:, :2]
+
+
+def drawn_on(view: Any, shifts_mm: Any) -> Any:
+    """Discs, one a slice, displaced with it: a ventricle seen through the stack."""
+    rows, columns = np.mgrid[: view.shape[0], : view.shape[1]] * PIXEL_MM
+    middle_mm = -view.corner_mm @ view.axes[:2].T
+    labels = [
+        np.hypot(columns - middle_mm[0] - s[0], rows - middle_mm[1] - s[1]) < 28 for s in shifts_mm
+    ]
+    return np.repeat(np.stack(labels)[None], MOMENTS, axis=0).astype(np.uint8)
+
+
+def in_view(view: Any, shifts_mm: Any) -> Any:
+    """Displacements along x and y of the body, as columns and rows of a view, apex first."""
+    flat = np.pad(shifts_mm, ((0, 0), (0, 1))) @ TURN.T @ view.axes[:2].T
+    return flat[list(view.order)] if len(shifts_mm) == len(view.order) else flat
+
+
+def left_mm(shifts_mm: Any) -> float:
+    """Root mean square of shifts, the mean apart, which no image can tell."""
+    return float(np.sqrt(np.square(shifts_mm - shifts_mm.mean(axis=0)).sum(axis=1).mean()))
+
+
+def test_crossings_tell_how_far_a_slice_lies_from_a_view() -> None:
+    cine, views, slices_mm, views_mm = stack_and_views(1, noise=0.0)
+    view = view_of(cine)
+    ours, theirs = in_view(view, slices_mm), in_view(view, views_mm)
+    found = find_crossings(cine, views, view, drawn_on(view, ours))
+    assert len(found.slices) > 0.8 * 3 * SLICES
+    error_mm = found.offsets_mm - (ours[list(found.slices)] - theirs[list(found.views)])
+    # Linear interpolation on 2 mm pixels and steps of 1 mm: the peak of smooth values lies within
+    # half a step of a parabola's; both images are blurred alike.
+    assert np.sqrt(np.square(error_mm).mean()) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None:
+    cine, views, slices_mm, _ = stack_and_views(seed)
+    view = view_of(cine)
+    truth = in_view(view, slices_mm)
+    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
+    crossings = find_crossings(cine, views, view, drawn)
+    seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
+    assert left_mm(truth - smooth) < left_mm(truth)
+    # Three lines a slice, each known to half a step (1 mm) of the search and better, leave
+    # 0.5 / sqrt(3) mm on either axis.
+    assert left_mm(truth - seen) < 0.5 * np.sqrt(2 / 3) < left_mm(truth - smooth)
+
+
+@pytest.mark.parametrize("wrong", ["another body", "displaced"])
+def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
+    cine, views, slices_mm, _ = stack_and_views(2)
+    view = view_of(cine)
+    truth = in_view(view, slices_mm)
+    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
+    if wrong == "another body":
+        off = stack_and_views(77)[1][0]
+    else:
+        moved = views[0].mr_from_index.copy()
+        moved[:3, 3] += (14.0, 21.0, 9.0)
+        off = replace(views[0], mr_from_index=moved)
+    crossings = find_crossings(cine, [off, *views[1:]], view, drawn)
+    seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
+    assert left_mm(truth - seen) < left_mm(truth - smooth)
+
+
+def test_a_view_that_contradicts_slices_and_views_is_left_out_of_the_equations() -> None:
+    """Offsets of one view drift from slice to slice as those of no rigid view can."""
+    cine, views, slices_mm, _ = stack_and_views(3)
+    view = view_of(cine)
+    truth = in_view(view, slices_mm)
+    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    good = find_crossings(cine, views, view, drawn)
+    offsets_mm = good.offsets_mm.copy()
+    third = np.array(good.views) == 2
+    offsets_mm[third] += np.linspace(-15, 15, third.sum())[:, None]
+    bad = replace(good, offsets_mm=offsets_mm)
+    with_bad = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, bad)
+    without = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, good.without(2))
+    np.testing.assert_allclose(with_bad, without, atol=1e-9)
+
+
+def test_slices_of_one_volume_are_not_moved() -> None:
+    cine, views, slices_mm, _ = stack_and_views(4)
+    view = view_of(cine)
+    drawn = drawn_on(view, in_view(view, slices_mm))
+    assert not slice_shifts_mm(drawn, PIXEL_MM, 2.0 * np.arange(SLICES), view.axes).any()
+    thin = replace(cine, mr_from_index=cine.mr_from_index @ np.diag([1, 1, 0.2, 1]))
+    assert find_crossings(thin, views, view_of(thin), drawn) is NO_CROSSINGS

@@ -1,0 +1,199 @@
+"""Confidence follows the errors of the labels; what is no heart, or spoilt, is refused by name."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from skimage.data import shepp_logan_phantom
+
+from data_synth.mr import MrSettings, acquire_cine
+from data_synth.population import draw_heart
+from pipeline.errors import StageError
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.inference import PlaneProbability
+from pipeline.imaging.labels import LABELS
+from pipeline.imaging.segmentation import segment_cine
+from pipeline.imaging.settings import SegmentSettings
+from pipeline.imaging.view import view_of
+
+QUICK = SegmentSettings(most_views=1)
+
+SLICES = 8
+
+NAMED = r"phases? \d+.*, slices? \d+"
+
+
+@pytest.fixture(scope="module")
+def study():
+    """A short stack of low signal to noise, two phases as research sets have them."""
+    rng = np.random.default_rng(314)
+    heart = draw_heart(rng, pathology="infarct")
+    mr = MrSettings(
+        phases=3, matrix=110, pixel_mm=2.0, snr=12.0, through_plane_samples=2, window_samples=1,
+        slices=SLICES,
+    )  # fmt: skip
+    cine = acquire_cine(rng, heart, [800.0] * SLICES, mr)
+    images = Cine(
+        cine.intensity[:2].astype(np.float32), cine.mr_from_index, np.array([0, 1 / 3]), 0.8
+    )
+    return images, cine.labels[:2]
+
+
+@pytest.fixture(scope="module")
+def understood(study):
+    return segment_cine(study[0], QUICK)
+
+
+def with_image(cine, phase, number, image):
+    images = cine.intensity.copy()
+    images[phase, number] = image
+    return replace(cine, intensity=images)
+
+
+def test_a_good_study_of_low_signal_is_trusted(understood):
+    assert understood.confidence.min() > 0.7
+
+
+@pytest.mark.parametrize(
+    ("number", "fault"), [(0, "elsewhere"), (4, "elsewhere"), (SLICES - 1, "noise")]
+)
+def test_a_spoilt_image_is_refused_at_either_end_and_between(study, number, fault):
+    """Noise, or another place of the body, in one phase of one slice."""
+    images, _ = study
+    image = images.intensity[1, number]
+    if fault == "noise":
+        spoilt = np.random.default_rng(number).rayleigh(image.mean(), image.shape)
+    else:
+        spoilt = np.roll(image, (25, 20), (0, 1))
+    with pytest.raises(StageError, match=rf"phase \d, slice {number}:"):
+        segment_cine(with_image(images, 1, number, spoilt.astype(np.float32)), QUICK)
+
+
+def test_a_blurred_slice_passes_with_a_lower_figure(study, understood):
+    images, _ = study
+    blurred = gaussian_filter(images.intensity[1, 4], 4.0)
+    found = segment_cine(with_image(images, 1, 4, blurred), QUICK)
+    assert found.confidence[1, 4] < understood.confidence[1, 4] - 0.01
+
+
+def test_lower_confidence_means_more_error(study):
+    """Noise from none to strong on a middle slice: confidence falls as Dice does."""
+    images, truth = study
+    rng = np.random.default_rng(0)
+    peak = np.percentile(images.intensity, 99)
+    settings = SegmentSettings(most_views=1, min_confidence=0.0)
+    dices, trusted = [], []
+    for share in (0.0, 0.25):
+        image = images.intensity[0, 4]
+        noisy = np.hypot(
+            image + rng.normal(0, share * peak, image.shape),
+            rng.normal(0, share * peak, image.shape),
+        )
+        found = segment_cine(with_image(images, 0, 4, noisy.astype(np.float32)), settings)
+        here, there = found.labels[0, 4], truth[0, 4]
+        same = ((here == there) & (there > 0)).sum()
+        dices.append(2 * same / ((here > 0).sum() + (there > 0).sum()))
+        trusted.append(found.confidence[0, 4])
+    assert dices[0] > dices[1]
+    assert trusted[0] > trusted[1]
+
+
+def still(values, phases=2, slices=8, side=128):
+    """The same image in every phase of slices that differ in brightness alone."""
+    image = np.broadcast_to(values, (phases, slices, side, side)).astype(np.float32).copy()
+    mr_from_index = np.diag([1.5, 1.5, 9.0, 1.0])
+    return Cine(image, mr_from_index, np.arange(phases) / phases, 1.0)
+
+
+def brain():
+    """Echo-planar images of a head, which come with nibabel for its own tests."""
+    path = Path(nibabel.__file__).parent / "tests" / "data" / "example4d.nii.gz"
+    image = nibabel.load(path)
+    intensity = np.asarray(image.dataobj, np.float32).transpose(3, 2, 1, 0)
+    mr_from_index = np.diag([-1.0, -1, 1, 1]) @ image.affine
+    return Cine(np.ascontiguousarray(intensity), mr_from_index, np.array([0, 0.5]), 1.0)
+
+
+def head():
+    drawn = shepp_logan_phantom()[::2, ::2].astype(np.float32)
+    padded = np.pad(drawn, 32)[:256, :256]
+    noise = np.random.default_rng(0).normal(0, 0.02, (2, 8, *padded.shape))
+    return replace(still(0.0, side=256), intensity=(padded + noise).astype(np.float32))
+
+
+def noise():
+    return still(np.random.default_rng(1).rayleigh(100.0, (2, 8, 128, 128)))
+
+
+def stripes():
+    return still(np.sin(np.arange(128) / 3.0))
+
+
+@pytest.mark.parametrize("what", [brain, head, noise, stripes])
+def test_what_is_no_heart_is_refused_with_phase_slice_and_advice(what):
+    with pytest.raises(StageError, match=NAMED) as refused:
+        segment_cine(what(), QUICK)
+    assert "check" in str(refused.value)
+
+
+def test_a_blank_image_is_named(study):
+    images, _ = study
+    with pytest.raises(StageError, match=r"phase 1, slice 7: .*alike"):
+        segment_cine(with_image(images, 1, 7, 0.0), QUICK)
+
+
+def beating(phases=6, slices=5, side=64):
+    """A shrinking and growing bright disc in textured surroundings, and its labels' chances."""
+    rng = np.random.default_rng(3)
+    body = gaussian_filter(rng.normal(0, 1, (slices + 4, side, side)), (2, 2, 2))[2:-2]
+    row, column = np.mgrid[:side, :side] - (side - 1) / 2
+    image = np.empty((phases, slices, side, side), np.float32)
+    value = np.zeros((phases, slices, 7, side, side), np.float32)
+    for phase in range(phases):
+        disc = np.hypot(row, column) < 15 + 3 * np.cos(2 * np.pi * phase / phases)
+        image[phase] = body / body.std() + 2 * disc
+        value[phase, :, LABELS["lv_cavity"]] = 0.9 * disc
+        value[phase, :, 0] = 1 - value[phase, :, 1]
+    mr_from_index = np.diag([1.5, 1.5, 10.0, 1.0])
+    cine = Cine(image, mr_from_index, np.arange(phases) / phases, 1.0)
+    return cine, PlaneProbability(value, view_of(cine), 1)
+
+
+def drawn(found):
+    return found.value.argmax(axis=2).astype(np.uint8)
+
+
+def test_confidence_is_the_chance_of_the_labels_where_images_and_labels_agree():
+    cine, found = beating()
+    np.testing.assert_allclose(slice_confidence(cine, found, drawn(found)), 0.9, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 2, 4])
+def test_an_image_unlike_its_neighbours_is_doubted_and_they_are_not(number):
+    cine, found = beating()
+    z = found.view.order[number]
+    cine.intensity[3, z] *= -1
+    doubt = slice_confidence(cine, found, drawn(found))
+    assert doubt[3, number] < 0.3
+    doubt[3, number] = 0.9
+    assert doubt.min() > 0.6
+
+
+def test_a_slice_spoilt_in_all_phases_is_doubted():
+    cine, found = beating()
+    z = found.view.order[4]
+    cine.intensity[:, z] *= -1
+    assert slice_confidence(cine, found, drawn(found))[:, 4].max() < 0.5
+
+
+def test_a_heart_that_jumps_for_one_phase_is_doubted():
+    cine, found = beating()
+    found.value[2, 2] = np.roll(found.value[2, 2], (20, 24), (1, 2))
+    doubt = slice_confidence(cine, found, drawn(found))
+    assert doubt[2, 2] < 0.3
+    doubt[2, 2] = 0.9
+    assert doubt.min() > 0.6
