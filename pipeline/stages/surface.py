@@ -7,29 +7,37 @@ from typing import Any
 import numpy as np
 
 from pipeline.job import Job
-from pipeline.products import read_labels, read_table, write_surfaces
-from pipeline.surface.extraction import extract_moving_surfaces
+from pipeline.products import read_labels, read_table, write_surfaces, write_table
+from pipeline.surface.extraction import extract
+from pipeline.surface.measures import measures
 
 
 def run(job: Job) -> dict[str, Any]:
-    """Write ``<structure>_000.vtp`` ... and measure volumes from the surfaces."""
+    """Write ``<structure>_000.vtp`` ... and ``measures.json``; see pipeline.surface.measures."""
     heart, mr_from_index = read_labels(job.products / "segment", "heart")
     phases = np.array(read_table(job.products / "ingest" / "phases.json")["phases"])
-    surfaces = extract_moving_surfaces(
-        heart, mr_from_index, phases, job.settings.surface, job.progress
-    )
-    write_surfaces(job.folder, surfaces)
-    volumes = {
-        name: [round(moving.at(k).volume_mm3() / 1000, 2) for k in range(len(phases))]
-        for name, moving in surfaces.items()
+    found = extract(heart, mr_from_index, phases, job.settings.surface, job.progress)
+    write_surfaces(job.folder, found.surfaces)
+    table = measures(found.surfaces)
+    write_table(job.folder / "measures.json", table)
+    return _headline(table) | {
+        "triangles": {name: len(moving.triangles) for name, moving in found.surfaces.items()},
+        "mended_phases": found.mended_phases,
+        "crossing_triangles": found.crossing_triangles,
     }
+
+
+def _headline(table: dict[str, Any]) -> dict[str, Any]:
+    """What a table of many patients shows: volumes, ejection, mass, and thickness of the wall."""
+    diastole, systole = table["end_diastole"], table["end_systole"]
+    thickness = table["lv_wall_thickness_mm"]["mean"]
     return {
-        "volumes_ml": volumes,
-        "lv_ejection_fraction": _ejection_fraction(volumes["lv_endocardium"]),
-        "triangles": {name: len(moving.triangles) for name, moving in surfaces.items()},
+        "volumes_ml": table["volumes_ml"],
+        "lv_ejection_fraction": table["lv_ejection_fraction"],
+        "rv_ejection_fraction": table["rv_ejection_fraction"],
+        "lv_mass_g": table["lv_mass_g"][diastole],
+        "lv_wall_thickness_mm": {
+            "end_diastole": thickness[diastole],
+            "end_systole": thickness[systole],
+        },
     }
-
-
-def _ejection_fraction(volumes_ml: list[float]) -> float:
-    """Stroke volume over end-diastolic volume."""
-    return round(1 - min(volumes_ml) / max(volumes_ml), 4)

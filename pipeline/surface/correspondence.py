@@ -8,14 +8,17 @@ cycle in both directions and the two are blended, so that the end of the beat me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Integer, Surface
+from pipeline.surface.kernels import chebyshev
 from pipeline.surface.level_set import LevelSet
 from pipeline.surface.mesh import laplacian, untangled, vertex_areas, vertex_normals
 
@@ -27,8 +30,16 @@ REACH_EDGES = (8.0, 3.0, 1.0)
 SMOOTHER_ERROR = 0.01
 ELASTIC_STEPS = 2
 FINISHING_STEPS = 2
+# Vertices of the surfaces within that tell an outer one where to go, and how near they should be.
+COMPANIONS = 12
+COMPANION_MM = 4.0
+# How near a surface must be to what it has grown on to slide with it, and the share of trust from
+# which on that is given up for its own sliding.
+GROWN_ON_MM = 8.0
+DOUBT = 0.3
 
 Smoother = Callable[[Float], Float]
+Across = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +56,16 @@ class Carrier:
         """Bring ``(n, 3)`` vertices onto a zero level by a smooth displacement, mm."""
         weights = vertex_areas(vertices_mm, self.triangles)
         start = affine_step(level, vertices_mm, weights / weights.sum())
+        return self.elastic(level, start, self.smoothers)
+
+    def elastic(self, level: LevelSet, start_mm: Float, smoothers: Sequence[Smoother]) -> Float:
+        """Bring vertices onto a zero level by displacements that smoothers let through."""
         bound_mm = 4 * level.spacing_mm
-        shift = np.zeros_like(start)
-        for smooth in self.smoothers:
+        shift = np.zeros_like(start_mm)
+        for smooth in smoothers:
             for _ in range(ELASTIC_STEPS):
-                shift = smooth(shift + level.newton_step(start + shift, bound_mm))
-        return self.settle(level, start + shift)
+                shift = smooth(shift + level.newton_step(start_mm + shift, bound_mm))
+        return self.settle(level, start_mm + shift)
 
     def settle(self, level: LevelSet, vertices_mm: Float) -> Float:
         """Remove what distance is left with small, still smooth steps along the normals."""
@@ -82,14 +97,9 @@ def make_smoother(stiffness: sparse.csr_array, reach_edges: float) -> Smoother:
     matrix = sparse.csr_array(sparse.eye_array(stiffness.shape[0]) + reach_edges**2 * stiffness)
 
     def smooth(values: Float) -> Float:
-        found = np.zeros_like(values)
-        rest, step, ratio = values, values / centre, radius / centre
-        for _ in range(rounds):
-            found = found + step
-            rest = rest - matrix @ step
-            following = 1 / (2 * centre / radius - ratio)
-            step = following * ratio * step + (2 * following / radius) * rest
-            ratio = following
+        found: Float = chebyshev(
+            matrix.indptr, matrix.indices, matrix.data, values, centre, radius, rounds
+        )
         return found
 
     return smooth
@@ -161,6 +171,102 @@ def carry_through_cycle(
         path[phase] = untangled(settled, template.triangles, levels[phase])
         _require_arrival(path[phase], levels[phase], phase, phases[phase])
     return path
+
+
+def carry_along(
+    template: Surface,
+    levels: Sequence[LevelSet],
+    reference: int,
+    phases: Float,
+    within_mm: Float,
+    across: Across = map,
+) -> Float:
+    """Positions ``(phase, n, 3)`` in mm of a surface that goes where those within it go.
+
+    Each vertex is first moved as the nearest vertices of the surfaces within are, by a mean under
+    a Gaussian; what distance is left to its own zero level is taken by smooth displacements. So
+    the hull of the heart slides as its chambers do, and ends the beat where they end it.
+
+    Parameters
+    ----------
+    template, levels, reference, phases
+        As for ``carry_through_cycle``.
+    within_mm
+        ``(phase, k, 3)`` corresponding vertices of the surfaces within.
+    across
+        Works through the phases: ``map``, or that of a pool of threads.
+
+    Raises
+    ------
+    StageError
+        When half the vertices end more than a voxel from the surface of some phase.
+    """
+    carrier = make_carrier(template)
+    way_at, _ = _companions(template.vertices_mm, within_mm, reference)
+
+    def at(k: int) -> Float:
+        if k == reference:
+            return template.vertices_mm
+        predicted = template.vertices_mm + carrier.smoothers[-2](way_at(k))
+        found = carrier.elastic(levels[k], predicted, carrier.smoothers[1:])
+        found = untangled(found, template.triangles, levels[k])
+        _require_arrival(found, levels[k], k, phases[k])
+        return found
+
+    return np.stack(list(across(at, range(len(levels)))))
+
+
+def drawn_along(
+    template: Surface, levels: Sequence[LevelSet], path_mm: Float, reference: int, beside_mm: Float
+) -> Float:
+    """Positions ``(phase, n, 3)`` of a surface whose sliding follows what it has grown on.
+
+    The shape of an atrium or of the aorta hardly tells how far its lower part slides; the
+    ventricles below do. Near them the sliding is theirs, further off the difference dies away
+    smoothly. Motion along the normals stays as it was.
+
+    Parameters
+    ----------
+    template, levels, reference
+        As for ``carry_through_cycle``.
+    path_mm
+        What that gave.
+    beside_mm
+        ``(phase, k, 3)`` corresponding vertices of the surfaces that this one has grown on.
+    """
+    carrier = make_carrier(template)
+    smooth = carrier.smoothers[0]
+    start = path_mm[reference]
+    way_at, far_mm = _companions(start, beside_mm, reference)
+    trust = np.exp(-0.5 * np.square(far_mm / GROWN_ON_MM))[:, None] * np.ones(3)
+    reach = smooth(trust) + DOUBT
+    places = path_mm.copy()
+    for k, level in enumerate(levels):
+        if k != reference:
+            pull = smooth(trust * (way_at(k) - (path_mm[k] - start))) / reach
+            normals = vertex_normals(path_mm[k], template.triangles)
+            pull -= np.einsum("ni,ni->n", pull, normals)[:, None] * normals
+            places[k] = carrier.settle(level, path_mm[k] + pull)
+    return places
+
+
+def _companions(
+    start_mm: Float, others_mm: Float, reference: int
+) -> tuple[Callable[[int], Float], Float]:
+    """Mean way ``(n, 3)`` until a phase of the others' vertices nearest each vertex; and how near.
+
+    The mean is under a Gaussian about the nearest one.
+    """
+    found = cKDTree(others_mm[reference]).query(start_mm, COMPANIONS)
+    far_mm, near = np.asarray(found[0]), np.asarray(found[1])
+    weights = np.exp(-0.5 * (np.square(far_mm) - np.square(far_mm[:, :1])) / COMPANION_MM**2)
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    def way_at(k: int) -> Float:
+        ways = (others_mm[k] - others_mm[reference])[near]
+        return np.asarray(np.einsum("nc,nci->ni", weights, ways))
+
+    return way_at, np.asarray(far_mm[:, 0])
 
 
 def _chain(carrier: Carrier, start_mm: Float, levels: Sequence[LevelSet]) -> list[Float]:

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import Float, Float32, Integer, Label, Mask, MovingSurface, transform_points
 from pipeline.imaging.labels import LABELS
-from pipeline.surface.correspondence import carry_through_cycle, restore_volume, smooth_in_time
+from pipeline.surface.correspondence import (
+    Across,
+    carry_along,
+    carry_through_cycle,
+    drawn_along,
+    restore_volume,
+    smooth_in_time,
+)
+from pipeline.surface.crossings import crossing_triangles
+from pipeline.surface.decimation import decimated
 from pipeline.surface.level_set import (
     LevelSet,
     enclosed_mm3,
@@ -18,9 +28,10 @@ from pipeline.surface.level_set import (
     smooth_union,
     with_sign_of,
 )
-from pipeline.surface.mesh import extract_surface, untangled
+from pipeline.surface.mesh import bad_triangles, extract_surface, uncrossed, untangled
 from pipeline.surface.settings import SurfaceSettings
 from pipeline.surface.solid import largest_piece, one_piece
+from pipeline.surface.unfolding import make_unfolder
 
 STRUCTURES: dict[str, tuple[str, ...]] = {
     "lv_endocardium": ("lv_cavity",),
@@ -33,7 +44,10 @@ STRUCTURES: dict[str, tuple[str, ...]] = {
 }
 """Labels that a surface encloses."""
 
-REQUIRED_LABELS = ("lv_cavity", "lv_myocardium")
+GROWN_ON = dict.fromkeys(("left_atrium", "right_atrium", "aorta"), ("epicardium", "rv_endocardium"))
+"""Structures that slide with others where they touch them."""
+
+REQUIRED_STRUCTURES = ("lv_endocardium", "epicardium")
 # A body below this many voxels is gone after smoothing.
 FEWEST_VOXELS = 60
 # Voxels of room round a body: as far as a distance is still of use.
@@ -42,6 +56,8 @@ MARGIN_VOXELS = 8
 BLEND_WIDENINGS = (1.0, 1.5, 2.0)
 
 Progress = Callable[[int, int], None]
+# The interpreter lock leaves nothing for more.
+THREADS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +74,30 @@ class Body:
     """Index ``(x, y, z)`` of the first voxel in the grid; negative where the body is padded."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """A body and its surface through the beat, in mm from the body's first voxel."""
+
+    body: Body
+    moving: MovingSurface
+    mended_phases: int = 0
+    crossing_triangles: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Extraction:
+    """Surfaces of a beating heart, and what had to be mended."""
+
+    surfaces: dict[str, MovingSurface]
+    """By name, as in ``STRUCTURES``."""
+
+    mended_phases: dict[str, int]
+    """In how many phases each had passed through itself before it was mended."""
+
+    crossing_triangles: dict[str, int]
+    """How many triangles of each, over all phases, still pass through others; 0 as it should be."""
+
+
 def extract_moving_surfaces(
     heart: Label,
     mr_from_index: Float,
@@ -65,7 +105,20 @@ def extract_moving_surfaces(
     settings: SurfaceSettings,
     progress: Progress | None = None,
 ) -> dict[str, MovingSurface]:
+    """Surfaces alone; see ``extract``."""
+    return extract(heart, mr_from_index, phases, settings, progress).surfaces
+
+
+def extract(
+    heart: Label,
+    mr_from_index: Float,
+    phases: Float,
+    settings: SurfaceSettings,
+    progress: Progress | None = None,
+) -> Extraction:
     """Closed, outward, corresponding surfaces of the structures of a labelled beating heart.
+
+    Structures are worked on side by side in ``THREADS`` threads; the result does not depend on it.
 
     Parameters
     ----------
@@ -82,9 +135,9 @@ def extract_moving_surfaces(
 
     Returns
     -------
-    dict
-        Surfaces by name, as in ``STRUCTURES``. A structure that no phase shows at a usable size
-        (a short stack may miss the aorta) is left out; the left ventricle never is.
+    Extraction
+        A structure that no phase shows at a usable size (a short stack may miss the aorta) is left
+        out; the left ventricle never is.
 
     Raises
     ------
@@ -96,23 +149,35 @@ def extract_moving_surfaces(
         heart lie far apart.
     """
     spacing_mm = _require_grid(heart, mr_from_index, phases)
-    parts = [name for name in STRUCTURES if name != "heart" and _is_present(heart, name, phases)]
-    bodies: dict[str, Body] = {}
-    surfaces = {}
-    for done, name in enumerate([*parts, "heart"]):
-        if name == "heart":
-            outer = [body for part, body in bodies.items() if part != "lv_endocardium"]
-            bodies[name] = _joined(outer, settings.heart_blend_mm, phases)
-        else:
-            bodies[name] = _body(heart, name, spacing_mm, settings.smoothing_voxels)
-        try:
-            moving = _moving_mesh(bodies[name], phases, settings)
-        except StageError as error:
-            raise StageError(f"{name}: {error}") from error
-        surfaces[name] = _placed(moving, bodies[name], mr_from_index)
-        if progress:
-            progress(done + 1, len(parts) + 1)
-    return surfaces
+    counts = _label_counts(heart)
+    parts = [name for name in STRUCTURES if name != "heart" and _is_present(counts, name, phases)]
+    tell = progress or (lambda done, total: None)
+
+    def carry(name: str) -> _Followed:
+        body = _body(heart, name, spacing_mm, settings.smoothing_voxels)
+        return _carried(name, body, phases, settings)
+
+    def finish(name: str) -> _Followed:
+        grown_on = [carried[other] for other in GROWN_ON.get(name, ()) if other in carried]
+        return _finished(_drawn(carried[name], grown_on, phases, settings), phases, settings, map)
+
+    followed: dict[str, _Followed] = {}
+    with ThreadPoolExecutor(THREADS) as pool:
+        carried = dict(zip(parts, pool.map(carry, parts), strict=True))
+        for name, one in zip(parts, pool.map(finish, parts), strict=True):
+            followed[name] = one
+            tell(len(followed), len(parts) + 1)
+        outer = [one for name, one in followed.items() if name != "lv_endocardium"]
+        followed["heart"] = _follow_heart(outer, phases, settings, pool.map)
+        placed = [_placed(one, mr_from_index) for one in followed.values()]
+        fewer = pool.map(lambda one: decimated(one, settings.decimation_error_mm), placed)
+        surfaces = dict(zip(followed, fewer, strict=True))
+    tell(len(followed), len(followed))
+    return Extraction(
+        surfaces,
+        {name: one.mended_phases for name, one in followed.items()},
+        {name: one.crossing_triangles for name, one in followed.items()},
+    )
 
 
 def _require_grid(heart: Label, mr_from_index: Float, phases: Float) -> float:
@@ -135,13 +200,18 @@ def _require_grid(heart: Label, mr_from_index: Float, phases: Float) -> float:
     return spacing_mm
 
 
-def _is_present(heart: Label, name: str, phases: Float) -> bool:
+def _label_counts(heart: Label) -> Integer:
+    """Voxels ``(phase, 256)`` of each label value."""
+    return np.stack([np.bincount(volume.ravel(), minlength=256) for volume in heart])
+
+
+def _is_present(label_counts: Integer, name: str, phases: Float) -> bool:
     """Whether a structure is there in all phases; StageError if in some, or if it must be."""
-    for label in STRUCTURES[name] if name in ("lv_endocardium", "epicardium") else ():
-        if not (heart == LABELS[label]).any():
+    for label in STRUCTURES[name] if name in REQUIRED_STRUCTURES else ():
+        if not label_counts[:, LABELS[label]].any():
             raise StageError(f"segmentation shows no {label} in any phase; look at its labels")
-    counts = np.array([np.count_nonzero(_solid(volume, name)) for volume in heart])
-    if (counts < FEWEST_VOXELS).all() and name not in ("lv_endocardium", "epicardium"):
+    counts = label_counts[:, [LABELS[label] for label in STRUCTURES[name]]].sum(axis=1)
+    if (counts < FEWEST_VOXELS).all() and name not in REQUIRED_STRUCTURES:
         return False
     if (counts < FEWEST_VOXELS).any():
         k = int(counts.argmin())
@@ -162,8 +232,8 @@ def _solid(volume: Label, name: str) -> Mask:
 def _body(heart: Label, name: str, spacing_mm: float, smoothing_voxels: float) -> Body:
     """Cut a structure out, make each phase one solid piece, and smooth it."""
     solid = np.stack([_solid(volume, name) for volume in heart])
-    seen = np.argwhere(solid.any(axis=0))
-    low, high = seen.min(axis=0), seen.max(axis=0) + 1
+    seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
+    low, high = np.array([(lines[0], lines[-1] + 1) for lines in seen]).T
     cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     padded = np.pad(cut, [(0, 0)] + [(MARGIN_VOXELS, MARGIN_VOXELS)] * 3)
     masks = [one_piece(mask) for mask in padded]
@@ -174,12 +244,12 @@ def _body(heart: Label, name: str, spacing_mm: float, smoothing_voxels: float) -
     )
 
 
-def _joined(bodies: Sequence[Body], blend_mm: float, phases: Float) -> Body:
+def _joined(bodies: Sequence[Body], blend_mm: float, phases: Float, across: Across) -> Body:
     """Bodies taken together, the seams between them bridged, as widely as one piece needs."""
     spacing_mm = bodies[0].levels[0].spacing_mm
     first = np.min([body.first_index for body in bodies], axis=0)
     for widening in BLEND_WIDENINGS:
-        unions = _unions(bodies, first, widening * blend_mm)
+        unions = _unions(bodies, first, widening * blend_mm, across)
         broken = [k for k, union in enumerate(unions) if _is_in_pieces(union < 0)]
         if not broken:
             break
@@ -189,21 +259,26 @@ def _joined(bodies: Sequence[Body], blend_mm: float, phases: Float) -> Body:
             f"heart: its parts lie in pieces in phase {k} (at {phases[k]:.3f} of the beat), too "
             f"far apart for seams of {blend_mm} mm to bridge; look at the labels of that phase"
         )
-    for k, union in enumerate(unions):
-        unions[k] = with_sign_of(union, one_piece(union < 0), spacing_mm)
-    levels = tuple(LevelSet(union, spacing_mm) for union in unions)
+
+    def mended(k: int) -> Float32:
+        return with_sign_of(unions[k], one_piece(unions[k] < 0), spacing_mm)
+
+    levels = tuple(LevelSet(union, spacing_mm) for union in across(mended, range(len(unions))))
     return Body(levels, tuple(enclosed_mm3(level) for level in levels), first)
 
 
-def _unions(bodies: Sequence[Body], first: Integer, blend_mm: float) -> list[Float32]:
+def _unions(
+    bodies: Sequence[Body], first: Integer, blend_mm: float, across: Across
+) -> list[Float32]:
     """Smooth union of the bodies in an array that holds them all, one a phase."""
     ends = [body.first_index + body.levels[0].distance_mm.shape[::-1] for body in bodies]
     shape = np.max(ends, axis=0) - first
-    unions = []
-    for k in range(len(bodies[0].levels)):
+
+    def union(k: int) -> Float32:
         placed = [_in_room(body.levels[k], body.first_index - first, shape) for body in bodies]
-        unions.append(smooth_union(placed, blend_mm))
-    return unions
+        return smooth_union(placed, blend_mm)
+
+    return list(across(union, range(len(bodies[0].levels))))
 
 
 def _is_in_pieces(mask: Mask) -> bool:
@@ -221,22 +296,91 @@ def _in_room(level: LevelSet, corner: Integer, shape: Integer) -> Float32:
     return room
 
 
-def _moving_mesh(body: Body, phases: Float, settings: SurfaceSettings) -> MovingSurface:
-    """The body's surface through the beat, in mm from its first voxel."""
+def _carried(name: str, body: Body, phases: Float, settings: SurfaceSettings) -> _Followed:
+    """One structure's surface through the beat by its own shape; StageError names the structure."""
+    reference = _reference(phases, settings)
+    try:
+        template = extract_surface(body.levels[reference], settings.edge_mm)
+        path = carry_through_cycle(template, body.levels, reference, phases)
+    except StageError as error:
+        raise StageError(f"{name}: {error}") from error
+    return _Followed(body, MovingSurface(path, template.triangles, phases))
+
+
+def _drawn(
+    one: _Followed, grown_on: Sequence[_Followed], phases: Float, settings: SurfaceSettings
+) -> _Followed:
+    """The same, sliding with the structures that it has grown on."""
+    if not grown_on:
+        return one
+    reference, moving = _reference(phases, settings), one.moving
+    beside_mm = _vertices_in(one.body, grown_on)
+    path = drawn_along(
+        moving.at(reference), one.body.levels, moving.vertices_mm, reference, beside_mm
+    )
+    return replace(one, moving=replace(moving, vertices_mm=path))
+
+
+def _vertices_in(body: Body, others: Sequence[_Followed]) -> Float:
+    """Vertices ``(phase, k, 3)`` of others, in mm from a body's first voxel."""
+    spacing_mm = body.levels[0].spacing_mm
+    shifts_mm = [spacing_mm * (other.body.first_index - body.first_index) for other in others]
+    return np.concatenate(
+        [one.moving.vertices_mm + shift for one, shift in zip(others, shifts_mm, strict=True)],
+        axis=1,
+    )
+
+
+def _follow_heart(
+    parts: Sequence[_Followed], phases: Float, settings: SurfaceSettings, across: Across
+) -> _Followed:
+    """The outer surface of all parts, which goes where they go."""
+    body = _joined([part.body for part in parts], settings.heart_blend_mm, phases, across)
+    reference = _reference(phases, settings)
+    within_mm = _vertices_in(body, parts)
+    try:
+        template = extract_surface(body.levels[reference], settings.edge_mm)
+        path = carry_along(template, body.levels, reference, phases, within_mm, across)
+    except StageError as error:
+        raise StageError(f"heart: {error}") from error
+    carried = _Followed(body, MovingSurface(path, template.triangles, phases))
+    return _finished(carried, phases, settings, across)
+
+
+def _reference(phases: Float, settings: SurfaceSettings) -> int:
+    """Number of the phase that is nearest to the reference, cyclically."""
     late = np.abs((phases - settings.reference_phase + 0.5) % 1.0 - 0.5)
-    reference = int(late.argmin())
-    template = extract_surface(body.levels[reference], settings.edge_mm)
-    path = carry_through_cycle(template, body.levels, reference, phases)
-    path = smooth_in_time(path, phases, settings.temporal_smoothing_beats)
-    places = []
-    for vertices, level, volume_mm3 in zip(path, body.levels, body.volumes_mm3, strict=True):
-        sound = untangled(vertices, template.triangles, level)
-        places.append(restore_volume(sound, template.triangles, volume_mm3))
-    return MovingSurface(np.stack(places), template.triangles, phases)
+    return int(late.argmin())
 
 
-def _placed(moving: MovingSurface, body: Body, mr_from_index: Float) -> MovingSurface:
+def _finished(
+    one: _Followed, phases: Float, settings: SurfaceSettings, across: Across
+) -> _Followed:
+    """Smooth in time, sound in every phase, and of the volume of the labels."""
+    body, triangles = one.body, one.moving.triangles
+    unfolder = make_unfolder(one.moving.at(_reference(phases, settings)))
+    unfolded = [unfolder.mended(vertices, bad_triangles) for vertices in one.moving.vertices_mm]
+    path_mm = smooth_in_time(np.stack(unfolded), phases, settings.temporal_smoothing_beats)
+
+    def sound(k: int) -> tuple[Float, bool, int]:
+        level, volume_mm3 = body.levels[k], body.volumes_mm3[k]
+        vertices = untangled(unfolder.mended(path_mm[k], bad_triangles), triangles, level)
+        vertices = restore_volume(vertices, triangles, volume_mm3)
+        vertices = untangled(vertices, triangles, level)
+        apart = unfolder.mended(vertices, crossing_triangles)
+        if apart is vertices:
+            return vertices, False, 0
+        apart = restore_volume(uncrossed(apart, triangles, level), triangles, volume_mm3)
+        return apart, True, int(np.count_nonzero(crossing_triangles(apart, triangles)))
+
+    places, mended, left = zip(*across(sound, range(len(path_mm))), strict=True)
+    moving = MovingSurface(np.stack(places), triangles, phases)
+    return _Followed(body, moving, sum(mended), sum(left))
+
+
+def _placed(followed: _Followed, mr_from_index: Float) -> MovingSurface:
     """The surface in LPS mm, its normals outward even when the grid is left-handed."""
+    moving, body = followed.moving, followed.body
     index = moving.vertices_mm / body.levels[0].spacing_mm + body.first_index
     triangles = moving.triangles
     if np.linalg.det(mr_from_index[:3, :3]) < 0:

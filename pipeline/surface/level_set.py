@@ -14,6 +14,7 @@ import SimpleITK as sitk
 from scipy import ndimage, special
 
 from pipeline.geometry import Float, Float32, Mask
+from pipeline.surface.kernels import sample
 
 # A blurred mask tells the distance out to about 3 standard deviations, where 32 bits run out.
 NEAR, FAR = 1.5, 2.5
@@ -34,26 +35,8 @@ class LevelSet:
 
         Both are of the trilinear interpolant. Points beyond the grid read its border.
         """
-        top = np.array(self.distance_mm.shape[::-1]) - 1.0
-        index = np.clip(points_mm / self.spacing_mm, 0, top)
-        cell = np.minimum(index.astype(np.int64), self.distance_mm.shape[::-1] - np.array(2))
-        u, v, w = (index - cell).T
-        rows, depth = self.distance_mm.shape[2], self.distance_mm.shape[1]
-        first = (cell[:, 2] * depth + cell[:, 1]) * rows + cell[:, 0]
-        flat = self.distance_mm.reshape(-1)
-        # Corners by (z, y); each is a pair along x.
-        low, slope = [], []
-        for step in (0, rows, rows * depth, rows * depth + rows):
-            start = flat[first + step].astype(np.float64)
-            rise = flat[first + step + 1] - start
-            low.append(start + u * rise)
-            slope.append(rise)
-        front, back = low[1] - low[0], low[3] - low[2]
-        near, far = low[0] + v * front, low[2] + v * back
-        along_x = (1 - w) * (slope[0] + v * (slope[1] - slope[0]))
-        along_x += w * (slope[2] + v * (slope[3] - slope[2]))
-        gradient = np.stack([along_x, front + w * (back - front), far - near], axis=1)
-        return near + w * (far - near), gradient / self.spacing_mm
+        values, gradients = sample(self.distance_mm, points_mm / self.spacing_mm)
+        return values, gradients / self.spacing_mm
 
     def newton_step(self, points_mm: Float, longest_mm: float) -> Float:
         """Displacements ``(n, 3)`` in mm that bring points onto the zero level to first order."""

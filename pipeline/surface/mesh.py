@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
@@ -9,6 +11,8 @@ from skimage.measure import marching_cubes
 
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Integer, Mask, Surface
+from pipeline.surface.crossings import crossing_triangles
+from pipeline.surface.kernels import corner_normals, faulty
 from pipeline.surface.level_set import LevelSet
 
 # Marching cubes with step h leaves 3/2 vertices per h^2 of surface (the mean of |nx|+|ny|+|nz|
@@ -16,6 +20,8 @@ from pipeline.surface.level_set import LevelSet
 EDGE_PER_STEP = (2 / np.sqrt(3) / 1.5) ** 0.5
 RELAXATIONS = 30
 UNTANGLINGS = 20
+# Rounds after which one more ring of vertices takes part.
+WIDENING_ROUNDS = 4
 SLIVER_QUALITY = 0.3
 
 
@@ -89,22 +95,14 @@ def laplacian(triangles: Integer, count: int) -> sparse.csr_array:
 
 def vertex_normals(vertices_mm: Float, triangles: Integer) -> Float:
     """Unit normals ``(n, 3)``: the area-weighted mean over the triangles of a vertex."""
-    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
-    face = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices_mm)
-    for k in range(3):
-        for axis in range(3):
-            normals[:, axis] += np.bincount(triangles[:, k], face[:, axis], len(vertices_mm))
+    normals, _ = corner_normals(vertices_mm, triangles)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.maximum(length, np.finfo(float).tiny))
 
 
 def vertex_areas(vertices_mm: Float, triangles: Integer) -> Float:
     """Third of the area ``(n,)`` of the triangles round each vertex, mm^2."""
-    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    shares = [np.bincount(triangles[:, k], area, len(vertices_mm)) for k in range(3)]
-    return np.asarray(np.sum(shares, axis=0))
+    return np.asarray(corner_normals(vertices_mm, triangles)[1] / 6)
 
 
 def triangle_quality(vertices_mm: Float, triangles: Integer) -> Float:
@@ -118,33 +116,56 @@ def triangle_quality(vertices_mm: Float, triangles: Integer) -> Float:
 def untangled(vertices_mm: Float, triangles: Integer, level: LevelSet) -> Float:
     """Vertices ``(n, 3)`` whose triangles are neither slivers nor folded over, as far as it goes.
 
-    Only vertices of bad triangles and their neighbours move: towards the mean of their own
-    neighbours, and back onto the zero level. Where the level itself is too sharp for the mesh that
-    folds them again, so the later rounds let the surface be round instead.
+    Only vertices of bad triangles and their neighbours move, and as long as that does not help
+    those round them too: towards the mean of their own neighbours, and back onto the zero level.
+    Where the level itself is too sharp for the mesh that folds them again, so the later rounds let
+    the surface be round instead.
     """
+    return _mended(vertices_mm, triangles, level, bad_triangles)
+
+
+def uncrossed(vertices_mm: Float, triangles: Integer, level: LevelSet) -> Float:
+    """Vertices ``(n, 3)`` of a mesh that no longer passes through itself, as far as it goes.
+
+    The zero level of a distance never crosses itself; where the mesh does, it is drawn back to it
+    as in ``untangled``. A mesh that does not cross itself is returned as it is.
+    """
+    return _mended(vertices_mm, triangles, level, crossing_triangles)
+
+
+def _mended(
+    vertices_mm: Float,
+    triangles: Integer,
+    level: LevelSet,
+    faults: Callable[[Float, Integer], Mask],
+) -> Float:
+    """Even out the surroundings of faulty triangles ``(m,)`` until there are none."""
+    wrong = faults(vertices_mm, triangles)
+    if not wrong.any():
+        return vertices_mm
     neighbours = adjacency(triangles, len(vertices_mm))
     degree = neighbours.sum(axis=1)[:, None]
     for done in range(UNTANGLINGS):
-        bad = bad_triangles(vertices_mm, triangles)
-        if not bad.any():
-            break
         touched = np.zeros(len(vertices_mm), dtype=bool)
-        touched[triangles[bad]] = True
-        touched |= neighbours @ touched.astype(float) > 0
-        pull = np.where(touched[:, None], neighbours @ vertices_mm / degree - vertices_mm, 0)
-        vertices_mm = vertices_mm + 0.5 * pull
+        touched[triangles[wrong]] = True
+        for _ in range(1 + done // WIDENING_ROUNDS):
+            touched |= neighbours @ touched.astype(float) > 0
+        moved = np.flatnonzero(touched)
+        places = vertices_mm[moved]
+        places += 0.5 * (neighbours[moved] @ vertices_mm / degree[moved] - places)
         if done < UNTANGLINGS / 2:
-            step = level.newton_step(vertices_mm, level.spacing_mm)
-            vertices_mm = vertices_mm + np.where(touched[:, None], step, 0)
+            places += level.newton_step(places, level.spacing_mm)
+        vertices_mm = vertices_mm.copy()
+        vertices_mm[moved] = places
+        wrong = faults(vertices_mm, triangles)
+        if not wrong.any():
+            break
     return vertices_mm
 
 
 def bad_triangles(vertices_mm: Float, triangles: Integer) -> Mask:
     """Which triangles ``(m,)`` are slivers or look away from the surface round them."""
-    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
-    around = vertex_normals(vertices_mm, triangles)[triangles].sum(axis=1)
-    folded = np.einsum("ij,ij->i", np.cross(b - a, c - a), around) <= 0
-    return np.asarray(folded | (triangle_quality(vertices_mm, triangles) < SLIVER_QUALITY))
+    return np.asarray(faulty(vertices_mm, triangles, SLIVER_QUALITY))
 
 
 def _relaxed(surface: Surface, level: LevelSet) -> Surface:

@@ -24,3 +24,6 @@ class SurfaceSettings(BaseModel):
 
     heart_blend_mm: float = Field(8.0, ge=0, le=16)
     """Width of the seams between chambers that the surface of the whole heart bridges smoothly."""
+
+    decimation_error_mm: float = Field(0.0, ge=0, le=2)
+    """Largest deviation, in any phase, by which flat parts may have fewer triangles; 0 for none."""

@@ -1,0 +1,98 @@
+"""Meshes that pass through themselves are found, and mended where their level set does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from surface_shapes import crossing_triangles as independent
+from surface_shapes import ellipsoid, voxel_centres
+
+from pipeline.geometry import Float, Surface
+from pipeline.surface.crossings import crossing_triangles
+from pipeline.surface.level_set import LevelSet, smooth_level_set
+from pipeline.surface.mesh import adjacency, extract_surface, uncrossed
+
+BESIDE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
+TWO = np.array([[0, 1, 2], [3, 4, 5]])
+
+
+def thin_body() -> tuple[Surface, LevelSet]:
+    """A lens 8 mm thick and 40 mm wide."""
+    points, _ = voxel_centres((30, 30, 14))
+    level = smooth_level_set(ellipsoid((20, 20, 4))(points) < 0, 1.5, 1.2)
+    return extract_surface(level, 2.5), level
+
+
+@pytest.mark.parametrize(
+    ("other", "crosses"),
+    [
+        ([[1, 1, -1], [1, 1, 1], [9, 9, 0]], True),
+        ([[1, 1, 0.01], [1, 1, 1], [9, 9, 1]], False),
+        ([[5, 5, -1], [5, 5, 1], [9, 9, 0]], False),
+        ([[-1, 1, -1], [9, 1, -1], [1, 1, 9]], True),
+    ],
+    ids=["pierces", "hovers", "passes by", "is pierced"],
+)
+def test_two_triangles_cross_or_not(other, crosses):
+    vertices = np.concatenate([BESIDE, np.array(other, float)])
+    np.testing.assert_array_equal(crossing_triangles(vertices, TWO), [crosses, crosses])
+
+
+def test_neighbours_that_touch_do_not_cross():
+    """Triangles that share a corner or an edge meet there and nowhere else."""
+    surface, _ = thin_body()
+    assert not crossing_triangles(surface.vertices_mm, surface.triangles).any()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.integers(4, 30))
+def test_it_agrees_with_solving_for_the_point_of_meeting(seed, count):
+    """Random triangles of all sizes, each pair asked on its own."""
+    rng = np.random.default_rng(seed)
+    corners = 10 * rng.random((count, 1, 3)) + rng.normal(0, 2, (count, 3, 3))
+    expected = np.zeros(count, bool)
+    for i in range(count):
+        for j in range(i):
+            if meets(corners[i], corners[j]) or meets(corners[j], corners[i]):
+                expected[[i, j]] = True
+    found = crossing_triangles(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+    np.testing.assert_array_equal(found, expected)
+
+
+def meets(one: Float, other: Float) -> bool:
+    """Whether an edge of one triangle meets another, from a 3x3 system for the point of meeting."""
+    for k in range(3):
+        p, q = one[k], one[(k + 1) % 3]
+        system = np.stack([q - p, other[0] - other[1], other[0] - other[2]], axis=1)
+        if abs(np.linalg.det(system)) < 1e-12:
+            continue
+        t, u, v = np.linalg.solve(system, other[0] - p)
+        if 0 < t < 1 and u > 0 and v > 0 and u + v < 1:
+            return True
+    return False
+
+
+def test_a_vertex_pushed_through_the_other_side_is_found_and_mended():
+    surface, level = thin_body()
+    spoiled = surface.vertices_mm.copy()
+    top = int(spoiled[:, 2].argmax())
+    ring = adjacency(surface.triangles, len(spoiled))[[top]].indices
+    spoiled[top, 2] -= 12
+    spoiled[ring, 2] -= 9.5
+    crossing = crossing_triangles(spoiled, surface.triangles)
+    assert crossing.any()
+    assert independent(Surface(spoiled, surface.triangles)) > 0
+
+    mended = uncrossed(spoiled, surface.triangles, level)
+
+    assert independent(Surface(mended, surface.triangles)) == 0
+    assert not crossing_triangles(mended, surface.triangles).any()
+    away = np.linalg.norm(spoiled - spoiled[top], axis=1) > 20
+    np.testing.assert_array_equal(mended[away], spoiled[away])
+
+
+def test_a_sound_mesh_is_returned_as_it_is():
+    surface, level = thin_body()
+    assert uncrossed(surface.vertices_mm, surface.triangles, level) is surface.vertices_mm
