@@ -182,23 +182,33 @@ def errors(found: Float | Float32, share: int, exact: tuple[Float | Float32, int
 
 
 def curve(rounds: int) -> None:
-    """Print our time against nodes and triangles, and the plane through it."""
+    """Print our time against nodes and triangles, and a sum of shares that describes it.
+
+    The share of triangles times nodes a side is felt where triangles are finer than the grid: every
+    block then measures all those that lie within a node's spacing of its nearest.
+    """
     cases = [(100_000, n) for n in (64, 96, 128, 192, 256)]
     cases += [(t, 128) for t in (5_000, 20_000, 50_000, 200_000, 400_000)]
-    print("\n| triangles | nodes | s | ns a node |\n" + "|---" * 4 + "|")
+    cases += [(400_000, 64), (400_000, 192), (20_000, 192)]
+    print("\n| triangles | nodes | s | core-s | core-ns a node |\n" + "|---" * 5 + "|")
     terms, seconds = [], []
     for wanted, nodes in cases:
         surface, grid = cup_surface(wanted), cube(nodes)
         distance_of_closed(surface, cube(8))
         runs = [timed(partial(distance_of_closed, surface, grid))[0] for _ in range(rounds)]
-        least = float(min(run[0] for run in runs))
-        terms.append((nodes**3, len(surface.triangles)))
+        clock, least = (float(one) for one in np.min(runs, axis=0))
+        terms.append((nodes**3, len(surface.triangles), nodes * len(surface.triangles)))
         seconds.append(least)
-        print(f"| {terms[-1][1]} | {nodes}^3 | {least:.3f} | {least / nodes**3 * 1e9:.0f} |")
+        print(
+            f"| {terms[-1][1]} | {nodes}^3 | {clock:.3f} | {least:.3f} "
+            f"| {least / nodes**3 * 1e9:.0f} |",
+            flush=True,
+        )
     share, *_ = np.linalg.lstsq(np.array(terms) / np.array(seconds)[:, None], np.ones(len(cases)))
     off = np.array(terms) @ share / seconds - 1
     print(
-        f"seconds = {share[0] * 1e9:.0f}e-9 nodes + {share[1] * 1e6:.2f}e-6 triangles, "
+        f"core-s = {share[0] * 1e9:.0f}e-9 nodes + {share[1] * 1e6:.2f}e-6 triangles "
+        f"+ {share[2] * 1e9:.0f}e-9 triangles x nodes a side, "
         f"off by {off.min():+.0%} to {off.max():+.0%}"
     )
 

@@ -1,9 +1,10 @@
 """What each way to interpolate a field would give: the table of docs/field.md, measured anew.
 
-``python benchmarks/interpolation_table.py [--spacing 1 1.5 2] [--structure NAME] [--seed N]``
+``python benchmarks/interpolation_table.py [--spacing 1 2] [--structure NAME] [--seed N] [--fit]``
 
 A beating surface of the phantom is baked at its phases; every way then answers at the true surface
-midway between phases, and in the band about it, where VTK's closest point on the true mesh is the
+midway between phases (``--fit``: the chosen way alone, before and after its fit to the surface),
+and in the band about it, where VTK's closest point on the true mesh is the
 truth. All ways run through the same plain kernel, so their times compare with each other but not
 with beatfield.h, which does the one chosen in a third of the time.
 """
@@ -22,8 +23,10 @@ from scipy.ndimage import spline_filter1d
 
 from data_synth.population import draw_heart
 from pipeline.field.distance import distance_of_closed
+from pipeline.field.fixture import BakeSettings
 from pipeline.field.spline import space_coefficients
-from pipeline.geometry import Float, Grid, Surface
+from pipeline.field.surface_fit import fit_to_surface
+from pipeline.geometry import Float, Grid, MovingSurface, Surface
 
 LINEAR, CATMULL_ROM, QUADRATIC, CUBIC = range(4)
 NAMES = ("linear", "Catmull-Rom", "quadratic B-spline", "cubic B-spline")
@@ -196,7 +199,9 @@ def nanoseconds(stored: Float, grid: Grid, way: tuple[int, int], rng: np.random.
     return float(np.median(spent))
 
 
-def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, seed: int) -> None:
+def rows(
+    surfaces: list[Surface], between: list[Surface], spacing_mm: float, seed: int, fit: bool
+) -> None:
     """Print the table of one spacing."""
     grid, distance_mm = bake(surfaces, spacing_mm)
     count = len(surfaces)
@@ -207,14 +212,19 @@ def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, see
     megabytes = distance_mm.size * 4e-6
     print(f"\n{spacing_mm:g} mm, {grid.shape[::-1]} nodes x {count} phases: {megabytes:.1f} MB\n")
     print(
-        "| space | time | on the surface, max / 99 % (mm) | band, 99 % (mm) "
+        "| space | time | on the surface, max / 99 % (mm) / share beyond 0.1 mm | band, 99 % (mm) "
         "| gradient, median / 95 % | step of force (N) | step of rate (mm/cycle) | ns |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for way in itertools.product(range(4), range(4)):
-        if way[0] != CHOSEN[0] and way[1] != CHOSEN[1]:
-            continue
+    ways = [(way, 0) for way in itertools.product(range(4), range(4))]
+    ways = [one for one in ways if one[0][0] == CHOSEN[0] or one[0][1] == CHOSEN[1]]
+    if fit:
+        ways = [(CHOSEN, 0)]
+    for way, rounds in [*ways, (CHOSEN, BakeSettings().fit_rounds)]:
         stored = prepared(distance_mm, *way)
+        start = time.process_time()
+        fit_to_surface(list(stored), *_moving(surfaces, grid), rounds)
+        spent = f", fitted in {time.process_time() - start:.1f} core-s" if rounds else ""
         here = np.abs(ask(stored, grid, way, on.points_mm, on.moments)[:, 0])
         band = ask(stored, grid, way, near.points_mm, near.moments)
         off = np.abs(band[:, 0] - near.distance_mm)
@@ -222,12 +232,19 @@ def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, see
         jump, rate = steps(stored, grid, way, near)
         mark = "**" if way == CHOSEN else ""
         print(
-            f"| {mark}{NAMES[way[0]]}{mark} | {mark}{NAMES[way[1]]}{mark} | {here.max():.3f} / "
-            f"{np.percentile(here, 99):.3f} | {np.percentile(off, 99):.3f} | "
+            f"| {mark}{NAMES[way[0]]}{mark} | {mark}{NAMES[way[1]]}{mark}{spent} | "
+            f"{here.max():.3f} / {np.percentile(here, 99):.3f} / {np.mean(here > 0.1):.1e} | "
+            f"{np.percentile(off, 99):.3f} | "
             f"{np.median(slope):.3f} / {np.percentile(slope, 95):.3f} | {jump:.4f} | {rate:.3f} | "
             f"{nanoseconds(stored, grid, way, rng):.0f} |",
             flush=True,
         )
+
+
+def _moving(surfaces: list[Surface], grid: Grid) -> tuple[Float, Grid, MovingSurface]:
+    phases = np.arange(len(surfaces)) / len(surfaces)
+    vertices_mm = np.stack([one.vertices_mm for one in surfaces])
+    return phases, grid, MovingSurface(vertices_mm, surfaces[0].triangles, phases)
 
 
 def main() -> None:
@@ -237,6 +254,7 @@ def main() -> None:
     parser.add_argument("--structure", default="epicardium")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--phases", type=int, default=25)
+    parser.add_argument("--fit", action="store_true", help="the chosen way alone")
     chosen = parser.parse_args()
     heart = draw_heart(np.random.default_rng(chosen.seed))
     every = np.arange(chosen.phases) / chosen.phases
@@ -245,7 +263,7 @@ def main() -> None:
         for phases in (every, every + 0.5 / chosen.phases)
     )
     for spacing_mm in chosen.spacing:
-        rows(surfaces, between, spacing_mm, chosen.seed)
+        rows(surfaces, between, spacing_mm, chosen.seed, chosen.fit)
 
 
 if __name__ == "__main__":

@@ -132,7 +132,7 @@ static double stretch(const bf_field *field, int structure, way how, int from)
         sum = answers[7];
         break;
     case FORCES:
-        bf_forces(field, 0, STRETCH, point, phases + from, STRETCH, answers);
+        bf_forces(field, 0, STRETCH, point, phases + from, STRETCH, answers, NULL);
         sum = answers[7];
         break;
     default:
@@ -160,22 +160,34 @@ static void compare(const bf_field *field, int structure, const char *where)
     }
 }
 
-/* All random questions as one batch, in the order that suits the memory. */
-static void sorted(const bf_field *field, int structure, const char *where)
+/* The questions in batches with scratch room, so that they may be answered in an order that suits
+ * the memory. */
+static void with_scratch(const bf_field *field, int structure, const char *where)
 {
-    unsigned *scratch = (unsigned *)malloc(COUNT * sizeof(unsigned));
-    double ns[5];
-    int n;
+    enum { ROUNDS = 5, SMALL = 1 << 18 };
+    static const char *names[3] = {"batch of 1,000,000 with scratch", "batches of 262,144 with scratch",
+                                   "forces in a batch with scratch"};
+    double *scratch = (double *)malloc(BF_SCRATCH * COUNT * sizeof(double)), ns[3][ROUNDS];
+    int n, how, from;
     if (!scratch) return;
-    for (n = 0; n < 5; n++) {
-        double start = used_ns();
-        bf_distances(field, structure, COUNT, points, phases, COUNT, answers, answers + COUNT, scratch);
-        ns[n] = (used_ns() - start) / COUNT;
-        sink = answers[7];
+    for (n = 0; n < ROUNDS; n++)
+        for (how = 0; how < 3; how++) {
+            int size = how == 1 ? SMALL : COUNT;
+            double start = used_ns();
+            for (from = 0; from + size <= COUNT; from += size) {
+                const double *point = points + 3 * (size_t)from;
+                if (how < 2)
+                    bf_distances(field, structure, size, point, phases + from, size, answers, answers + COUNT, scratch);
+                else bf_forces(field, 0, size, point, phases + from, size, answers, scratch);
+            }
+            ns[how][n] = (used_ns() - start) / from;
+            sink = answers[7];
+        }
+    for (how = 0; how < 3; how++) {
+        qsort(ns[how], ROUNDS, sizeof(double), by_size);
+        printf("%s\t%s\t%.2f\n", where, names[how], ns[how][ROUNDS / 2]);
+        printf("%s, quickest tenth\t%s\t%.2f\n", where, names[how], ns[how][0]);
     }
-    qsort(ns, 5, sizeof(double), by_size);
-    printf("%s\tbatch, sorted\t%.2f\n", where, ns[2]);
-    printf("%s, quickest tenth\tbatch, sorted\t%.2f\n", where, ns[0]);
     free(scratch);
 }
 
@@ -280,14 +292,14 @@ int main(int count, char **words)
     if (!points || !phases || !answers) return 2;
     on_a_path(&field);
     compare(&field, structure, "C, coherent path");
-    sorted(&field, structure, "C, coherent path");
+    with_scratch(&field, structure, "C, coherent path");
     latencies(&field, structure);
     at_random(&field, 1);
     compare(&field, structure, "C, random places at one phase");
-    sorted(&field, structure, "C, random places at one phase");
+    with_scratch(&field, structure, "C, random places at one phase");
     at_random(&field, 0);
     compare(&field, structure, "C, random places and phases");
-    sorted(&field, structure, "C, random places and phases");
+    with_scratch(&field, structure, "C, random places and phases");
     tools(&field);
     bf_close(&field);
     free(points);

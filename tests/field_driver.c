@@ -66,7 +66,7 @@ static int refuse(const bf_field *field)
              bf_force(field, 0, bad, 0, force) == BF_NOT_FINITE &&
              bf_force(field, 0, point, INFINITY, force) == BF_NOT_FINITE &&
              bf_distance(field, 99, point, 0, force, NULL) == BF_NO_SUCH_NAME &&
-             bf_forces(field, 0, 1, point, phases, 2, force) == BF_WRONG_SIZE &&
+             bf_forces(field, 0, 1, point, phases, 2, force, NULL) == BF_WRONG_SIZE &&
              bf_tool_force(field, 0, &none, identity, 0, 0.1, force, NULL, NULL) == BF_WRONG_SIZE &&
              bf_structure(field, "none") == -1 && bf_fixture(field, "") == -1);
 }

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.field import ForceField, get_include
+from pipeline.field.batches import FEW, follow
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
 from pipeline.field.store import FieldWriter
@@ -18,12 +19,13 @@ ORIGIN_MM = (-3.0, 4.0, 5.5)
 SPACING_MM = (1.5, 2.0, 0.7)
 WAYS = {"four at a time": [], "one at a time": ["-DBEATFIELD_PLAIN"]}
 EVEN = np.arange(25) / 25
+MANY = (np.arange(60) + 0.3 * np.sin(np.arange(60))) / 60 + 0.005
 UNEVEN = np.array([0.01, 0.02, 0.021, 0.4, 0.97])
 
 
-def write_random(path: Path, width: int, phases: Float) -> Float:
+def write_random(path: Path, width: int, phases: Float, height: int = 5, depth: int = 3) -> Float:
     """A store with random coefficients; no surface has such a distance, but no weight can hide."""
-    shape = (3, 5, width)
+    shape = (depth, height, width)
     law = Fixture(structure="s", kind="guidance", delta_mm=3.0, f_max_n=1.0)
     about = FieldMetadata(
         phases=phases.tolist(),
@@ -99,7 +101,7 @@ def programs(tmp_path_factory):
     return {name: folder / name for name in WAYS}
 
 
-@pytest.mark.parametrize("phases", [EVEN, UNEVEN, UNEVEN[:2], UNEVEN[:1]], ids=len)
+@pytest.mark.parametrize("phases", [EVEN, MANY, UNEVEN, UNEVEN[:2], UNEVEN[:1]], ids=len)
 @pytest.mark.parametrize("width", [2, 3, 4, 5, 9])
 def test_every_reader_follows_the_text(tmp_path, programs, width, phases):
     path = tmp_path / "field.zarr"
@@ -128,3 +130,63 @@ def test_every_reader_follows_the_text(tmp_path, programs, width, phases):
         found = np.frombuffer(done.stdout)
         np.testing.assert_allclose(found[: len(points)], expected[:, 0], **close)
         np.testing.assert_allclose(found[len(points) :].reshape(-1, 3), expected[:, 1:], **close)
+
+
+def random_questions(count: int, shape_xyz: tuple[int, int, int]) -> Float:
+    """Places in the grid and a little beyond, and phases of three beats: ``(count, 4)``."""
+    rng = np.random.default_rng(count)
+    high = ORIGIN_MM + (np.array(shape_xyz) - 1) * SPACING_MM
+    places = rng.uniform(np.array(ORIGIN_MM) - 1, high + 1, (count, 3))
+    return np.column_stack([places, rng.uniform(-1, 2, count)])
+
+
+@pytest.mark.parametrize("phases", [EVEN, MANY], ids=len)
+@pytest.mark.parametrize("count", [1023, 4096])
+def test_sorted_answers_of_c_are_those_of_single_questions(tmp_path, programs, phases, count):
+    """The driver compares bit for bit, and looks whether the scratch room was used."""
+    path = tmp_path / "field.zarr"
+    # Three phases take more than the 512 KB of a bin, so that there are several slabs.
+    write_random(path, 40, phases, 40, 32)
+    questions = random_questions(count, (40, 40, 32))
+    field = ForceField.open(path)
+    expected = field.distance_mm(questions[:, :3], questions[:, 3])
+    for program in programs.values():
+        given = questions.tobytes()
+        done = subprocess.run(
+            [program, path, "random"], input=given, capture_output=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, b"")
+        found = np.frombuffer(done.stdout)[:count]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("one_phase", [False, True])
+@pytest.mark.parametrize("phases", [EVEN, MANY, UNEVEN[:1]], ids=len)
+def test_sorted_answers_of_python_are_those_of_single_questions(tmp_path, phases, one_phase):
+    write_random(tmp_path / "field.zarr", 40, phases, 40, 32)
+    field = ForceField.open(tmp_path / "field.zarr")
+    questions = random_questions(2 * FEW, (40, 40, 32))
+    places, moments = questions[:, :3], np.array([0.3]) if one_phase else questions[:, 3]
+    assert not follow(places, moments, field._numbers, len(phases))
+
+    force_n = field.force_n(places, moments)
+    distance_mm = field.distance_mm(places, moments)
+
+    each = np.broadcast_to(moments, len(places))
+    for n in range(0, len(places), 7):
+        where = (*places[n].tolist(), float(each[n]))
+        assert field.force_at(*where) == tuple(force_n[n])
+        assert field.distance_at(*where) == distance_mm[n]
+
+
+def test_questions_along_a_path_are_answered_as_they_come():
+    """A hand of 100 mm/s at 1 kHz, on the grid of a heart: sorting would only cost time."""
+    way = 0.1 * np.arange(FEW)
+    path = np.column_stack([30 * np.sin(way / 30), 30 * np.cos(way / 30), way / 100])
+    grid = np.array([-50.0, -50, -50, 2, 2, 2, 50, 50, 50, 0.5, 0.5, 0.5])
+    beats = np.arange(FEW) / 800
+
+    assert follow(path, beats % 1, grid, 25)
+    assert follow(path, beats % 1, grid, 100)
+    assert not follow(path, np.random.default_rng(0).random(FEW), grid, 25)
+    assert not follow(np.random.default_rng(0).permutation(path), np.zeros(1), grid, 25)

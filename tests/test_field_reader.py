@@ -1,6 +1,7 @@
 """Questions to a baked field: against closed forms, plain NumPy, and difference quotients."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -15,6 +16,7 @@ from scipy.ndimage import map_coordinates
 from pipeline.errors import InputError
 from pipeline.field import Fixture, ForceField
 from pipeline.field.bake import bake_field
+from pipeline.field.manifest import write_manifest
 from pipeline.field.potential import direction_scale, offence, potential, pull
 from pipeline.field.query import query_point
 from pipeline.geometry import Float
@@ -305,6 +307,35 @@ def test_query_answers_for_every_fixture(path, field):
     assert list(query_point(path, (14.0, 2, 1), 0.3, "guide")) == ["guide"]
     with pytest.raises(InputError, match="no fixture 'x'"):
         query_point(path, (0.0, 0, 0), 0.3, "x")
+
+
+def test_query_says_what_the_device_has_to_follow(path, field):
+    """The force rate of a tool at rest: the change over the millisecond about the moment."""
+    point, phase = (16.0, 2.0, 1.0), 0.3
+    answer = query_point(path, point, phase)["guide"]
+    moments = phase + np.array([-0.5, 0.5]) * 1e-3 / RR_S
+
+    before, after = field.force_n([point, point], moments, "guide")
+
+    assert answer["force_rate_n_per_ms"] == pytest.approx(np.linalg.norm(after - before))
+    # The ball shrinks from 18 to 15 mm in a quarter of 0.8 s: 15 mm/s or so, at most 3 times that
+    # in the spline, on a slope of 386 N/m at most.
+    assert 0 < answer["force_rate_n_per_ms"] <= 3 * 0.015 * 0.386
+    assert answer["stiffness_n_per_m"] == FIXTURES["guide"].stiffness_n_per_m
+    assert answer["stiffness_limit_n_per_m"] == 400
+
+
+def test_a_store_with_a_fixture_that_its_device_cannot_render_is_refused(path, tmp_path):
+    folder = tmp_path / "f.zarr"
+    shutil.copytree(path, folder)
+    content = json.loads((folder / "zarr.json").read_text())
+    content["attributes"]["beatfield"]["fixtures"]["guide"]["delta_mm"] = 0.5
+    (folder / "zarr.json").write_text(json.dumps(content))
+    (folder / "manifest.json").unlink()
+    write_manifest(folder)
+
+    with pytest.raises(InputError, match=r"fixture guide: .*stiffer than the touch.* 400 N/m"):
+        query_point(folder, (14.0, 2, 1), 0.3)
 
 
 def test_reading_loads_no_heavy_library(path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.field.certificate import BeatingSurface, certify, require_bounds
+from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import (
     distance_of_closed,
     require_no_open_edge,
@@ -26,10 +27,13 @@ from pipeline.field.metadata import (
     require_name,
     require_phases,
 )
+from pipeline.field.motion import BeatingSurface
 from pipeline.field.potential import offence, potential
 from pipeline.field.reader import ForceField
 from pipeline.field.spline import space_coefficients
 from pipeline.field.store import FieldWriter
+from pipeline.field.surface_fit import fit_to_surface
+from pipeline.field.threads import processors
 from pipeline.geometry import Float, Float32, Grid, Surface, require_rigid
 
 
@@ -124,10 +128,33 @@ def bake_field(
             writer.write(name, index, values)
         count.step()
     writer.solve_splines_in_time()
+    metadata = _fit(writer, metadata, chosen, grid, settings.fit_rounds)
     accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
     require_bounds(accuracy, settings.bounds, settings.spacing_mm)
     writer.finish(metadata.model_copy(update={"accuracy": accuracy}))
     return accuracy
+
+
+def _fit(
+    writer: FieldWriter,
+    metadata: FieldMetadata,
+    surfaces: Mapping[str, BeatingSurface],
+    grid: Grid,
+    rounds: int,
+) -> FieldMetadata:
+    """Bring the splines' zeros to the surfaces; the description with what that changed."""
+    phases = np.array(metadata.phases)
+
+    def correct(name: str) -> float:
+        return fit_to_surface(writer.splines(name), phases, grid, surfaces[name], rounds)
+
+    with ThreadPoolExecutor(processors()) as pool:
+        changes = list(pool.map(correct, surfaces))
+    structures = {
+        name: part.model_copy(update={"correction_mm": change})
+        for (name, part), change in zip(metadata.structures.items(), changes, strict=True)
+    }
+    return metadata.model_copy(update={"structures": structures})
 
 
 class _Count:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.field.exact import ExactSurface, points_about
-from pipeline.field.fixture import DEVICES, Bounds
+from pipeline.field.fixture import DEVICES, Bounds, Fixture
+from pipeline.field.motion import BeatingSurface, Motion, halfway
 from pipeline.field.reader import ForceField
 from pipeline.field.threads import processors
 from pipeline.geometry import Float, Surface
@@ -25,18 +26,10 @@ DIRECTION_BAND_MM = 5.0
 DIRECTION_SAMPLES = 60
 """Directions are checked nearer, at fewer points: there the fixtures act."""
 STEP_MM, STEP_MS = 0.1, 1.0
+CLEAR_GRADIENT = 0.5
+"""Where the gradient is as long as this, the force has the size that the law gives it: it is
+shorter about the medial axis alone, where the force passes through zero."""
 FORCE_SAMPLES = 4000
-
-
-class BeatingSurface(Protocol):
-    """Anything that gives a closed surface for every stored phase."""
-
-    @property
-    def phases(self) -> Float:
-        """``(phase,)`` in [0, 1), rising."""
-
-    def at(self, index: int) -> Surface:
-        """The surface at stored phase number ``index``."""
 
 
 def certify(
@@ -73,7 +66,7 @@ def certify(
                 step.result()
             progress()
     structures = {
-        name: _over_phases(found) | {"drift_max_mm": _drift_mm(volume, name, surfaces[name])}
+        name: _over_phases(found) | _drift(volume, name, surfaces[name])
         for name, found in distances.items()
     }
     fixtures = {name: one.result() for name, one in forces.items()}
@@ -85,6 +78,17 @@ def certify(
         "structures": structures,
         "fixtures": fixtures,
     }
+
+
+def rate_bound_n_per_mm(fixture: Fixture, spacing_mm: float) -> float:
+    """The stated bound of how fast a force changes with place, on the medial axis too, N/mm.
+
+    The direction is the gradient projected onto a ball and divided by its radius 1/2, which turns
+    no faster than twice the gradient does. Across a kink the distances of three nodes in a row have
+    a second difference of 2 spacings at most, and the spline's coefficients of twice that, so its
+    slope changes by 4 / spacing. To this comes the law's own stiffness.
+    """
+    return 8 * fixture.f_max_n / spacing_mm + fixture.stiffness_n_per_m / 1000
 
 
 def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: float) -> None:
@@ -181,28 +185,25 @@ def _over_phases(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _drift_mm(volume: ForceField, structure: str, moving: BeatingSurface) -> float | None:
+def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[str, float | None]:
     """How far the field's surface is, halfway between phases, from the smoothly moving one.
 
-    The vertices' own periodic cubic spline in time is the measure; None where vertices do not
-    correspond, or phases are too few for a spline.
+    The measure is the interpolated distance at all vertices, on their own periodic spline in time;
+    None where vertices do not correspond, or phases are too few for a spline.
     """
-    from scipy.interpolate import CubicSpline
-
-    phases = volume.phases
-    each = [moving.at(index) for index in range(len(phases))]
-    same = all(np.array_equal(one.triangles, each[0].triangles) for one in each)
-    if not same or len(phases) < 3:
-        return None
-    chosen = np.random.default_rng(0).integers(len(each[0].vertices_mm), size=500)
-    places = np.stack([one.vertices_mm[chosen] for one in [*each, each[0]]])
-    path = CubicSpline(np.append(phases, phases[0] + 1), places, bc_type="periodic")
-    gaps = np.diff(phases, append=phases[0] + 1)
-    largest = 0.0
-    for moment in phases + gaps / 2:
-        off_mm = volume.distance_mm(path(moment), moment, structure)
-        largest = max(largest, float(np.percentile(np.abs(off_mm), 99)))
-    return largest
+    motion = Motion.of(moving)
+    if motion is None:
+        return {"drift_max_mm": None, "drift_p99_mm": None}
+    off_mm = np.concatenate(
+        [
+            volume.distance_mm(motion.at(moment).vertices_mm, moment, structure)
+            for moment in halfway(volume.phases).tolist()
+        ]
+    )
+    return {
+        "drift_max_mm": float(np.abs(off_mm).max()),
+        "drift_p99_mm": float(np.percentile(np.abs(off_mm), 99)),
+    }
 
 
 def _largest(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -255,7 +256,7 @@ class _ForceSteps:
         return self._volume.force_n(nodes_mm, phase, self._name).reshape(*grid.shape, 3)
 
     def _small_steps(self, index: int) -> tuple[float, float | None, float]:
-        """Largest change of force over 0.1 mm and over 1 ms, and steepest slope, N/m."""
+        """Largest change of force over 0.1 mm and over 1 ms, and stiffness, N/m."""
         rng = np.random.default_rng(index)
         volume, name = self._volume, self._name
         surface = self._surface.at(index)
@@ -269,9 +270,22 @@ class _ForceSteps:
         if volume.rr_s is not None:
             after_n = volume.force_n(points_mm, moments + STEP_MS / 1000 / volume.rr_s, name)
             late = float(np.linalg.norm(after_n - here_n, axis=1).max())
-        close = np.abs(volume.distance_mm(points_mm, moments, self._fixture.structure))
-        near = step_n[close <= self._near_mm].max(initial=0.0)
-        return float(step_n.max()), late, 1000 * float(near) / STEP_MM
+        return float(step_n.max()), late, self._stiffness(points_mm, moments, here_n)
+
+    def _stiffness(self, points_mm: Float, moments: Float, here_n: Float) -> float:
+        """Largest change of the force's size along its own line, N/m, off the medial axis.
+
+        Its direction turns too, fastest about the medial axis; that is the rate's part.
+        """
+        structure = self._fixture.structure
+        gradient = self._volume.gradient(points_mm, moments, structure)
+        length = np.linalg.norm(gradient, axis=1, keepdims=True)
+        ahead_mm = points_mm + STEP_MM * gradient / np.maximum(length, 1e-9)
+        there = self._volume.gradient(ahead_mm, moments, structure)
+        clear = np.minimum(length[:, 0], np.linalg.norm(there, axis=1)) >= CLEAR_GRADIENT
+        ahead_n = np.linalg.norm(self._volume.force_n(ahead_mm, moments, self._name), axis=1)
+        change_n = np.abs(ahead_n - np.linalg.norm(here_n, axis=1))[clear]
+        return 1000 * float(change_n.max(initial=0.0)) / STEP_MM
 
     def result(self) -> dict[str, Any]:
         """The largest steps over space and, the cycle closed, over time."""
@@ -287,6 +301,8 @@ class _ForceSteps:
             "force_change_max_n": max(changes_n),
             "force_change_max_n_per_ms": None if None in lates else max(lates) / STEP_MS,
             "force_step_max_n_per_0_1_mm": max(steps),
+            "force_rate_max_n_per_mm": max(steps) / STEP_MM,
+            "force_rate_bound_n_per_mm": rate_bound_n_per_mm(self._fixture, spacing_mm.min()),
             "stiffness_measured_n_per_m": max(slopes),
             "stiffness_n_per_m": self._fixture.stiffness_n_per_m,
             "stiffness_limit_n_per_m": DEVICES[self._fixture.device].stiffness_n_per_m,

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from pipeline.errors import InputError
 from pipeline.field.manifest import MANIFEST
-from pipeline.field.metadata import FieldMetadata
+from pipeline.field.metadata import FieldMetadata, FixturePart
 from pipeline.geometry import Float32, Grid
 
 ATTRIBUTES = "zarr.json"
@@ -80,12 +80,12 @@ def read_metadata(path: Path) -> FieldMetadata:
     Raises
     ------
     InputError
-        When they are missing or wrong.
+        When they are missing or wrong, or a fixture is more than its haptic device can render.
     """
     source = path / ATTRIBUTES
     try:
         attributes = json.loads(source.read_bytes())["attributes"]["beatfield"]
-        return FieldMetadata.model_validate(attributes)
+        metadata = FieldMetadata.model_validate(attributes)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
@@ -94,3 +94,14 @@ def read_metadata(path: Path) -> FieldMetadata:
         raise InputError(
             f"{source}: holds no beatfield attributes ({error!r}); give a field.zarr"
         ) from error
+    for name, part in metadata.fixtures.items():
+        _require_renderable(source, name, part)
+    return metadata
+
+
+def _require_renderable(source: Path, name: str, part: FixturePart) -> None:
+    try:
+        part.fixture()
+    except ValidationError as error:
+        said = error.errors()[0]["msg"]
+        raise InputError(f"{source}: fixture {name}: {said}; bake the field again") from error

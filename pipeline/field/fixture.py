@@ -220,6 +220,10 @@ class BakeSettings(Section):
     structures: tuple[str, ...] = ()
     """Surfaces to bake beside those that a fixture needs."""
 
+    fit_rounds: int = Field(default=12, ge=0, le=100)
+    """Steps of the least squares that bring the interpolated zero to the moving surface, between
+    nodes and phases too; 0 leaves the plain interpolation."""
+
     samples: int = Field(default=500, ge=100)
     """Random points per surface and phase at which the finished field is checked."""
 

@@ -1,4 +1,4 @@
-"""Compiled kernels: the spline through the baked distance, its gradient, potential and force.
+"""Compiled kernels: the spline through the baked distance, its gradient, and the force.
 
 Importing this module imports numba; only functions that need it do so. The kernels release the
 interpreter lock, so callers split work over threads.
@@ -10,7 +10,6 @@ import functools
 import math
 from typing import Any
 
-import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.core import cgutils
@@ -32,7 +31,7 @@ ASKED: dict[str, Any] = {
     "nogil": True, "cache": True, "fastmath": CONTRACT, "no_cfunc_wrapper": True,
 }  # fmt: skip
 # No way in from Python, which would be compiled too.
-_INNER = {**ASKED, "no_cpython_wrapper": True}
+INNER = {**ASKED, "no_cpython_wrapper": True}
 
 
 _FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)
@@ -108,7 +107,7 @@ def _sum(typing_context: Any, phases: Any, rows: Any, weights: Any) -> Any:
     return types.UniTuple(types.float64, 4)(phases, rows, weights), generate
 
 
-@njit(**_INNER)
+@njit(**INNER)
 def _three(place, count):  # type: ignore[no-untyped-def]
     """Three neighbours of a place on one axis, their weights, and their slopes per step.
 
@@ -127,7 +126,7 @@ def _three(place, count):  # type: ignore[no-untyped-def]
     return middle, (w0, w1, w2), (s0, s1, s2)
 
 
-@njit(**_INNER)
+@njit(**INNER)
 def _four(weights, left):  # type: ignore[no-untyped-def]
     """Weights of three neighbours as those of four nodes, the first of them at ``left``."""
     w0, w1, w2 = weights
@@ -139,8 +138,8 @@ def _four(weights, left):  # type: ignore[no-untyped-def]
     return (w1, w2, 0.0, 0.0) if left < 0 else (0.0, 0.0, w0, w1)
 
 
-@njit(**_INNER)
-def _moment(line, phase):  # type: ignore[no-untyped-def]
+@njit(**INNER)
+def moment_of(line, phase):  # type: ignore[no-untyped-def]
     """Interval of a phase in ``spline.timeline``, and the weights of its three phases."""
     first, count = line[0, 0], len(line)
     turned = phase
@@ -163,11 +162,11 @@ def _moment(line, phase):  # type: ignore[no-untyped-def]
     return low, (before, 1.0 - before - after, after)
 
 
-@njit(**_INNER)
-def _at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
-    """Distance and gradient at one point; see ``sample``."""
+@njit(**INNER)
+def spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Distance and gradient at one point whose numbers are finite; see ``sample``."""
     width, height, depth = int(grid[6]), int(grid[7]), int(grid[8])
-    k, time = _moment(line, phase)
+    k, time = moment_of(line, phase)
     last = len(addresses) - 1
     p0, p2 = addresses[k - 1 if k > 0 else last], addresses[k + 1 if k < last else 0]
     i, wx, sx = _three((x_mm - grid[0]) * grid[9], width)
@@ -193,15 +192,20 @@ def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore
     """
     if not math.isfinite(x_mm + y_mm + z_mm + phase):
         return math.nan, math.nan, math.nan, math.nan
-    return _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
+    return spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
 
 
-@njit(**_INNER)
-def _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
-    distance_mm, gx, gy, gz = _at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
+@njit(**INNER)
+def felt_at(law, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Force and distance at one point whose numbers are finite: four numbers.
+
+    ``law`` is the first seven arguments of ``force_at``.
+    """
+    addresses, line, grid, side, delta_mm, m, f_max_n = law
+    distance_mm, gx, gy, gz = spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
     size = _pull(distance_mm, side, delta_mm, m)
     scale = -f_max_n * size * _direction_scale(math.sqrt(gx * gx + gy * gy + gz * gz))
-    return scale * gx, scale * gy, scale * gz
+    return scale * gx, scale * gy, scale * gz, distance_mm
 
 
 @njit(**ASKED)
@@ -209,7 +213,9 @@ def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm
     """Force at one point: three newtons, none where the question has a number that is none."""
     if not math.isfinite(x_mm + y_mm + z_mm + phase):
         return math.nan, math.nan, math.nan
-    return _force(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase)
+    law = (addresses, line, grid, side, delta_mm, m, f_max_n)
+    fx, fy, fz, _ = felt_at(law, x_mm, y_mm, z_mm, phase)
+    return fx, fy, fz
 
 
 @njit(**ASKED)
@@ -234,7 +240,7 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
     """
     for n in range(len(points_mm)):
         phase = phases[n if len(phases) > 1 else 0]
-        value, gx, gy, gz = _at(
+        value, gx, gy, gz = spline_at(
             addresses, line, grid, points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase
         )
         distance_mm[n] = value
@@ -242,159 +248,9 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
 
 
 @njit(**ASKED)
-def sample_force(addresses, line, grid, side, delta_mm, m, f_max_n, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
-    """Force at points into ``(n, 3)``; the arguments are those of ``sample`` and ``force_at``."""
+def sample_force(law, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
+    """Force at points into ``(n, 3)``; ``law`` is the first seven arguments of ``force_at``."""
     for n in range(len(points_mm)):
         phase = phases[n if len(phases) > 1 else 0]
-        fx, fy, fz = _force(
-            addresses, line, grid, side, delta_mm, m, f_max_n,
-            points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase,
-        )  # fmt: skip
+        fx, fy, fz, _ = felt_at(law, points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase)
         force_n[n, 0], force_n[n, 1], force_n[n, 2] = fx, fy, fz
-
-
-HALVINGS = 12
-"""A stretch of a tool is halved no more often than this."""
-
-
-@njit(**_INNER)
-def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
-    """Point of a tool at a length along it, into ``feel[:3]``.
-
-    ``walk`` holds the piece that was asked for last, its start and length: places asked for one
-    after the other are near each other. A closed line repeats its first point.
-    """
-    pieces = len(line_mm) - 1
-    piece, start, length = int(walk[0]), walk[1], walk[2]
-    while along > start + length and piece + 1 < pieces:
-        start += length
-        piece += 1
-        length = _piece_length(line_mm, piece)
-    while along < start and piece > 0:
-        piece -= 1
-        length = _piece_length(line_mm, piece)
-        start -= length
-    walk[0], walk[1], walk[2] = piece, start, length
-    share = (along - start) / length if length > 0 else 0.0
-    end = piece + 1 if pieces > 0 else piece
-    for axis in range(3):
-        feel[axis] = line_mm[piece, axis] + share * (line_mm[end, axis] - line_mm[piece, axis])
-
-
-@njit(**_INNER)
-def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
-    x = line_mm[piece + 1, 0] - line_mm[piece, 0]
-    y = line_mm[piece + 1, 1] - line_mm[piece, 1]
-    z = line_mm[piece + 1, 2] - line_mm[piece, 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@njit(**_INNER)
-def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-untyped-def]
-    """Ask at a length along a tool: its point, the force and the distance into ``feel``."""
-    addresses, line, grid, side, delta_mm, m, f_max_n = law
-    _on_tool(line_mm, along, walk, feel)
-    x = pose[0, 0] * feel[0] + pose[0, 1] * feel[1] + pose[0, 2] * feel[2] + pose[0, 3]
-    y = pose[1, 0] * feel[0] + pose[1, 1] * feel[1] + pose[1, 2] * feel[2] + pose[1, 3]
-    z = pose[2, 0] * feel[0] + pose[2, 1] * feel[1] + pose[2, 2] * feel[2] + pose[2, 3]
-    distance_mm, gx, gy, gz = _at(addresses, line, grid, x, y, z, phase)
-    size = _pull(distance_mm, side, delta_mm, m)
-    scale = -f_max_n * size * _direction_scale(math.sqrt(gx * gx + gy * gy + gz * gz))
-    feel[3], feel[4], feel[5], feel[6] = scale * gx, scale * gy, scale * gz, distance_mm
-
-
-@njit(**_INNER)
-def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
-    """Add a share of a felt force, and of its torque about the handle."""
-    ax, ay, az = feel[0] - handle_mm[0], feel[1] - handle_mm[1], feel[2] - handle_mm[2]
-    x = pose[0, 0] * ax + pose[0, 1] * ay + pose[0, 2] * az
-    y = pose[1, 0] * ax + pose[1, 1] * ay + pose[1, 2] * az
-    z = pose[2, 0] * ax + pose[2, 1] * ay + pose[2, 2] * az
-    for axis in range(3):
-        found[axis] += weight * feel[3 + axis]
-    found[3] += weight * (y * feel[5] - z * feel[4])
-    found[4] += weight * (z * feel[3] - x * feel[5])
-    found[5] += weight * (x * feel[4] - y * feel[3])
-
-
-@njit(**ASKED)
-def tool_force(law, line_mm, handle_mm, pose, phase, bound_n, found):  # type: ignore[no-untyped-def]
-    """Force and torque on a line of straight pieces: the mean over its length, within a bound.
-
-    The same steps as ``bf_tool_force`` of the C header: stretches are halved until Simpson's rule
-    changes the midpoint's by less than the bound, unless the distance, which changes by no more
-    than the way, shows that the whole stretch feels less than the bound.
-
-    Parameters
-    ----------
-    law
-        The first seven arguments of ``force_at``.
-    line_mm
-        ``(n, 3)`` points of the tool in its own frame; a closed line repeats its first.
-    handle_mm
-        ``(3,)`` in the tool's frame: torque is about it.
-    pose
-        4x4 ``mr_from_tool``.
-    phase, bound_n
-        Moment, and largest error of the force.
-    found
-        Where force (N) and torque (N mm) go: six numbers, 0 before.
-
-    Returns
-    -------
-    How often the field was asked.
-    """
-    grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
-    walk = np.zeros(3)
-    total = 0.0
-    for piece in range(len(line_mm) - 1):
-        total += _piece_length(line_mm, piece)
-    if len(line_mm) > 1:
-        walk[2] = _piece_length(line_mm, 0)
-    longest = 2.0 * min(grid[3], grid[4], grid[5])
-    count = max(math.ceil(total / (4.0 * longest)), 1)
-    stack, places = np.empty((HALVINGS + 2, 7)), np.empty((HALVINGS + 2, 4))
-    left, right = np.empty(7), np.empty(7)
-    asked = 0
-    for number in range(count):
-        middle = (number + 0.5) * total / count
-        _feel(law, line_mm, pose, phase, middle, walk, stack[0])
-        asked += 1
-        if total == 0.0:
-            _add(found, stack[0], 1.0, pose, handle_mm)
-            continue
-        places[0, 0], places[0, 1], places[0, 2], places[0, 3] = (
-            middle, total / count, 1.0 / count, 0.0,
-        )  # fmt: skip
-        top = 0
-        while top >= 0:
-            middle, length, share = places[top, 0], places[top, 1], places[top, 2]
-            depth, here = places[top, 3], stack[top]
-            way = 0.5 * length
-            farthest = abs(here[6]) + way if side == 0 else here[6] + side * way
-            if 2.0 * f_max_n * abs(_pull(farthest, side, delta_mm, m)) <= bound_n:
-                _add(found, here, share, pose, handle_mm)
-                top -= 1
-                continue
-            _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
-            _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
-            asked += 2
-            off = 0.0
-            for axis in range(3, 6):
-                change = 0.5 * (left[axis] + right[axis]) - here[axis]
-                off += change * change
-            if (length <= longest and off <= bound_n * bound_n) or depth == HALVINGS:
-                _add(found, left, share * 2 / 3, pose, handle_mm)
-                _add(found, right, share * 2 / 3, pose, handle_mm)
-                _add(found, here, -share / 3, pose, handle_mm)
-                top -= 1
-                continue
-            # Whole rows at once would take a second longer to compile.
-            for n in range(7):
-                stack[top, n], stack[top + 1, n] = right[n], left[n]
-            places[top, 0], places[top, 1] = middle + way / 2, way
-            places[top, 2], places[top, 3] = share / 2, depth + 1
-            places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way
-            places[top + 1, 2], places[top + 1, 3] = share / 2, depth + 1
-            top += 1
-    return asked

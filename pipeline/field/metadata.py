@@ -18,11 +18,15 @@ Row = tuple[float, float, float, float]
 
 INTERPOLATION = {
     "space": "quadratic B-spline whose coefficients are the arrays under spline/; beyond the "
-    "boundary they go on in a straight line; points outside the grid are moved to its boundary",
+    "boundary they go on in a straight line; about each surface they were corrected, by "
+    "correction_mm at most, to bring the zero to the moving surface; points "
+    "outside the grid are moved to its boundary",
     "time": "quadratic B-spline with knots halfway between phases; the first follows the last",
     "force": "-f_max * f(q) * direction, f and the direction from the interpolated distance",
     "direction": "gradient / max(length of the gradient, 0.5): a unit vector except near the "
     "medial axis, where it passes continuously through zero",
+    "rate": "on the medial axis the force passes through zero without a step, and changes with "
+    "place by at most 8 f_max / spacing + stiffness (N/mm), accuracy's force_rate_bound_n_per_mm",
 }
 
 
@@ -45,11 +49,14 @@ class StructurePart(Part):
 
     path: str
     spline: str
-    """Coefficients of the spline that takes these distances at the nodes and phases."""
+    """Coefficients of the spline that readers evaluate. It takes these distances at the nodes and
+    phases, but for the correction about the surface."""
     triangles: list[int]
     """Per phase."""
     volume_ml: list[float]
     """Per phase, enclosed."""
+    correction_mm: float = Field(default=0.0, ge=0)
+    """Largest change of a coefficient that brought the spline's zero to the moving surface."""
 
 
 class FixturePart(Part):

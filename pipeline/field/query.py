@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pipeline.field.fixture import DEVICES
 from pipeline.field.reader import ForceField
 
 
@@ -20,7 +23,7 @@ def query_point(
     point_mm
         ``(x, y, z)``, LPS mm of the MR frame.
     phase
-        Place in the heartbeat, [0, 1).
+        Share of the heartbeat since the R peak; only its fraction counts.
     fixture
         Name of the only one to ask; all of them when None.
 
@@ -28,11 +31,15 @@ def query_point(
     -------
     By fixture: ``structure``, ``distance_mm``, ``potential``, ``force_n`` (x, y, z) and
     ``inside_grid``, False where the answer is that of the grid's nearest boundary point.
+    ``force_rate_n_per_ms`` is how quickly the force changes for a tool at rest there, None where
+    the heartbeat's duration is unknown; ``stiffness_n_per_m`` is the fixture's steepest slope, and
+    ``stiffness_limit_n_per_m`` what its device can render, None where that is unknown.
 
     Raises
     ------
     InputError
-        When the field cannot be read, the fixture is unknown or a number is not finite.
+        When the field cannot be read or has a fixture that its device cannot render, the fixture
+        is unknown or a number is not finite.
     """
     field = ForceField.open(path)
     points = [point_mm]
@@ -45,7 +52,22 @@ def query_point(
             "potential": float(field.potential(points, phase, name)[0]),
             "force_n": field.force_n(points, phase, name)[0].tolist(),
             "inside_grid": bool(field.contains(points)[0]),
+            "force_rate_n_per_ms": _force_rate(field, point_mm, phase, name),
+            "stiffness_n_per_m": law.stiffness_n_per_m,
+            "stiffness_limit_n_per_m": DEVICES[law.device].stiffness_n_per_m,
         }
         for name, law in field.fixtures.items()
         if fixture in (None, name)
     }
+
+
+def _force_rate(
+    field: ForceField, point_mm: tuple[float, float, float], phase: float, name: str
+) -> float | None:
+    """Change of the force over the millisecond about a moment, at a place at rest, N/ms."""
+    if field.rr_s is None:
+        return None
+    beats = 0.001 / field.rr_s
+    moments = np.array([phase - beats / 2, phase + beats / 2])
+    before, after = field.force_n([point_mm, point_mm], moments, name)
+    return float(np.linalg.norm(after - before))

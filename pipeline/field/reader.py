@@ -6,8 +6,8 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -22,14 +22,11 @@ from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
 from pipeline.field.spline import timeline
-from pipeline.field.threads import processors
+from pipeline.field.threads import in_parts
 from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
 
 if TYPE_CHECKING:
     from pipeline.field.tool import Tool
-
-POINTS_A_WORKER = 16_384
-"""Fewer points are answered before another thread would have started."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,15 +211,15 @@ class ForceField:
 
         ``-f_max f(q) direction``, with the direction in which the potential rises.
         """
-        from pipeline.field.kernels import sample_force
+        from pipeline.field.batches import sample_force
 
         self._fixture(fixture)
         law = self._laws[fixture or self._first]
         points = _as_points(points_mm)
         phases = _as_phases(phase, len(points))
         force_n = np.empty((len(points), 3))
-        _in_parts(
-            lambda part, moments: sample_force(*law, points[part], moments, force_n[part]),
+        in_parts(
+            lambda part, moments: sample_force(law, points[part], moments, force_n[part]),
             phases,
             len(points),
         )
@@ -288,7 +285,7 @@ class ForceField:
         mr_from_tool
             4x4, the tool's pose in LPS mm.
         phase
-            Place in the heartbeat.
+            Share of the heartbeat since the R peak; only its fraction counts.
         fixture
             Which; the first when None.
         bound_n
@@ -299,23 +296,33 @@ class ForceField:
         InputError
             When the pose is not rigid, a number not finite, or the fixture unknown.
         """
-        from pipeline.field.kernels import tool_force
-
-        require_rigid(np.asarray(mr_from_tool), "mr_from_tool")
-        if not (bound_n > 0 and np.isfinite(phase)):
+        kernel = self._tool_force or self._load_tools()
+        if not (bound_n > 0 and math.isfinite(phase)):
             raise InputError(f"bound_n = {bound_n} must be above 0, and phase = {phase} finite")
-        self._fixture(fixture)
-        law = self._laws[fixture or self._first]
-        pose, handle_mm = np.asarray(mr_from_tool, float), np.array(tool.handle_mm)
-        found, weight, asked = np.zeros(6), 0.0, 0
-        for line_mm in tool.lines_mm():
-            part = np.zeros(6)
-            line = np.ascontiguousarray(line_mm, dtype=float)
-            asked += tool_force(law, line, handle_mm, pose, float(phase), float(bound_n), part)
-            length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) or 1.0
-            found += length * part
-            weight += length
-        return ToolForce(found[:3] / weight, found[3:] / weight, asked)
+        try:
+            law = self._laws[fixture or self._first]
+        except KeyError:
+            raise self._unknown("fixture", fixture, self._laws) from None
+        pose = np.ascontiguousarray(mr_from_tool, dtype=np.float64)
+        lines, found = tool.lines, np.empty(6)
+        asked = -1
+        if pose.shape == (4, 4):
+            asked = kernel(
+                law, lines.points_mm, lines.starts, tool.handle_mm, pose,
+                float(phase), float(bound_n), found,
+            )  # fmt: skip
+        if asked < 0:
+            require_rigid(pose, "mr_from_tool")
+            raise InputError(f"mr_from_tool: is no rotation and shift to 1e-3, got\n{pose}")
+        return ToolForce(found[:3], found[3:], asked)
+
+    _tool_force: Any = None
+
+    def _load_tools(self) -> Any:
+        from pipeline.field.tool_kernels import tool_force
+
+        self._tool_force = tool_force
+        return tool_force
 
     _distance_at: Any = None
     _force_at: Any = None
@@ -347,13 +354,13 @@ class ForceField:
     def _sample(
         self, points_mm: npt.ArrayLike, phase: npt.ArrayLike, structure: str
     ) -> tuple[Float, Float]:
-        from pipeline.field.kernels import sample
+        from pipeline.field.batches import sample
 
         points = _as_points(points_mm)
         phases = _as_phases(phase, len(points))
         distance_mm, gradient = np.empty(len(points)), np.empty((len(points), 3))
         field = (self._addresses[structure], self._line, self._numbers)
-        _in_parts(
+        in_parts(
             lambda part, moments: sample(
                 *field, points[part], moments, distance_mm[part], gradient[part]
             ),
@@ -361,21 +368,6 @@ class ForceField:
             len(points),
         )
         return distance_mm, gradient
-
-
-def _in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) -> None:
-    """Ask about ``count`` points, shared among the processors where they are many."""
-
-    def part(start: int, end: int) -> None:
-        ask(slice(start, end), phases if len(phases) == 1 else phases[start:end])
-
-    workers = min(processors(), count // POINTS_A_WORKER)
-    if workers < 2:
-        part(0, count)
-        return
-    edges = np.linspace(0, count, workers + 1).astype(int).tolist()
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(part, edges[:-1], edges[1:]))
 
 
 def _not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
@@ -399,5 +391,7 @@ def _as_phases(phase: npt.ArrayLike, count: int) -> Float:
     if phases.shape not in {(1,), (count,)}:
         raise InputError(f"phase must be one number or ({count},), got shape {phases.shape}")
     if not np.isfinite(phases).all():
-        raise InputError("phase must be finite; it is a place in the heartbeat, [0, 1)")
+        raise InputError(
+            "phase must be finite; it is a share of the heartbeat, and its fraction counts"
+        )
     return phases

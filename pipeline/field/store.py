@@ -74,6 +74,15 @@ class FieldWriter:
                 for phase, values in zip(mapped, solved, strict=True):
                     phase[start : start + SLAB] = values
 
+    def splines(self, structure: str) -> list[Float32]:
+        """The spline arrays of a structure, mapped for changes: ``(z, y, x)``, one a phase."""
+        folder = self._path / self._metadata.structures[structure].spline
+        shape = self._metadata.grid.shape_zyx
+        return [
+            np.memmap(chunk_path(folder, index), dtype="<f4", mode="r+", shape=shape)
+            for index in range(len(self._metadata.phases))
+        ]
+
     def finish(self, metadata: FieldMetadata) -> None:
         """Write the final attributes, then the manifest."""
         self._group.update_attributes(attributes(metadata))

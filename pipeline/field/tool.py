@@ -7,10 +7,14 @@ tool's own frame (mm): z along the shaft or axis, the tip (or the middle of a ri
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.errors import InputError
@@ -24,9 +28,31 @@ CORNERS = 48
 LINES_ROUND_A_CYLINDER = 8
 
 
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """All lines of a tool, as the compiled kernel takes them."""
+
+    points_mm: Float
+    """``(n, 3)`` points of one line after the other, in the tool's frame."""
+
+    starts: npt.NDArray[np.int64]
+    """Number of each line's first point, and n."""
+
+
 class _Tool(Section):
     handle_mm: Point = (0.0, 0.0, 0.0)
     """Where the hand holds it, in the tool's frame: torque is about this point."""
+
+    @abstractmethod
+    def lines_mm(self) -> list[Float]:
+        """Its lines, ``(n, 3)`` each, in the tool's frame."""
+
+    @cached_property
+    def lines(self) -> Lines:
+        """All its lines, made once: a loop asks about the same tool again and again."""
+        parts = self.lines_mm()
+        starts = np.concatenate([[0], np.cumsum([len(part) for part in parts])])
+        return Lines(np.ascontiguousarray(np.concatenate(parts)), starts.astype(np.int64))
 
 
 class Needle(_Tool):

@@ -62,10 +62,35 @@ static void seal(const void *text, size_t length)
     put("manifest.json", manifest, strlen(manifest));
 }
 
+/* A few questions in the way that a batch sorts many. */
+static void sort(const bf_field *field, int fixture, const double *q)
+{
+    enum { SOME = 9 };
+    double points[3 * SOME], phases[SOME], answers[4 * SOME], scratch[BF_SCRATCH * SOME];
+    bf__batch batch;
+    int n;
+    for (n = 0; n < SOME; n++) {
+        memcpy(points + 3 * n, q + n % 7, 3 * sizeof(double));
+        phases[n] = q[n];
+    }
+    if (bf__askable(SOME, points, phases, SOME) != BF_OK) return;
+    memset(&batch, 0, sizeof batch);
+    batch.field = field;
+    batch.structure = field->fixture[fixture].structure;
+    batch.count = SOME;
+    batch.points_mm = points;
+    batch.phases = phases;
+    batch.many_phases = 1;
+    batch.first = answers;
+    batch.rest = answers + SOME;
+    bf__answer_sorted(&batch, scratch);
+    batch.law = &field->fixture[fixture];
+    bf__answer_sorted(&batch, scratch);
+}
+
 static void ask(const bf_field *field, const double *q)
 {
     double answer[6], torque[3], line[9], distance[2];
-    unsigned scratch[2];
     double pose[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
     bf_tool tool;
     int n;
@@ -77,8 +102,9 @@ static void ask(const bf_field *field, const double *q)
     for (n = 0; n < field->fixtures && n < 4; n++) {
         bf_force(field, n, q, q[3], answer);
         bf_potential(field, n, q + 1, q[4], answer);
-        bf_forces(field, n, 2, q, q + 6, 2, answer);
-        bf_distances(field, field->fixture[n].structure, 2, q, q + 6, 2, distance, answer, scratch);
+        bf_forces(field, n, 2, q, q + 6, 2, answer, NULL);
+        bf_distances(field, field->fixture[n].structure, 2, q, q + 6, 2, distance, answer, NULL);
+        sort(field, n, q);
         /* A tool of any length is asked up to a million times: only short ones here. */
         if (fabs(q[0]) + fabs(q[1]) + fabs(q[2]) + fabs(q[3]) + fabs(q[4]) + fabs(q[5]) < 50 &&
             fabs(q[6]) + fabs(q[7]) + fabs(q[8]) < 50 && field->spacing_mm[0] > 0.5 &&

@@ -40,7 +40,8 @@
 extern "C" {
 #endif
 
-#define BF_NAME 64 /* longest name of a structure or fixture, with its end */
+#define BF_NAME 64   /* longest name of a structure or fixture, with its end */
+#define BF_SCRATCH 4 /* numbers a question that a batch wants as scratch room */
 
 typedef enum {
     BF_OK = 0,
@@ -109,11 +110,12 @@ bf_status bf_distance(const bf_field *field, int structure, const double point_m
                       double *distance_mm, double gradient[3]);
 
 /* The same at many points, (count, 3) numbers; phases has one number, or count of them. Scratch may
- * be NULL; with room for count numbers there, questions are answered in an order of its own, which
- * is quicker if they are many and neither places nor phases follow one another. */
+ * be NULL. With room for BF_SCRATCH numbers a question there, questions that are many, and neither
+ * whose places nor whose phases follow one another, are answered in an order of its own, several
+ * times as fast; the answers are the same. Answers may not lie where the questions do. */
 bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
                        const double *phases, size_t phase_count, double *distances_mm,
-                       double *gradients, unsigned *scratch);
+                       double *gradients, double *scratch);
 
 /* Potential of a fixture, in [0, 1). */
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
@@ -123,9 +125,9 @@ bf_status bf_potential(const bf_field *field, int fixture, const double point_mm
 bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
                    double force_n[3]);
 
-/* Forces at many points, (count, 3) numbers each; phases has one number, or count of them. */
+/* Forces at many points, (count, 3) numbers each; otherwise as bf_distances. */
 bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
-                    const double *phases, size_t phase_count, double *forces_n);
+                    const double *phases, size_t phase_count, double *forces_n, double *scratch);
 
 /* A rigid tool: straight pieces through points of its own frame, from the first to the last, and
  * back to the first where it is closed. */
@@ -1164,47 +1166,6 @@ static double bf__at(const bf_field *field, int structure, const double point_mm
     return bf__sum(field, &at, gradient);
 }
 
-enum { BF__BINS = 4096, BF__AHEAD = 16, BF__CACHE = 1 << 19 };
-
-/* Into which of the bins a question falls: by phase first, then by height. */
-static int bf__bin(const bf_field *field, double z_mm, double phase, int slabs)
-{
-    double turned, place = (z_mm - field->origin_mm[2]) * field->per_mm[2] / field->shape[2];
-    int k = bf__interval(field, phase, &turned);
-    return k * slabs + (place > 0 ? place < 1 ? (int)(place * slabs) : slabs - 1 : 0);
-}
-
-/* Numbers of the questions, those about neighbouring coefficients after one another (a counting
- * sort): random questions then find in the cache what others have read. */
-static void bf__sort(const bf_field *field, size_t count, const double *points_mm, const double *phases,
-                     size_t phase_count, unsigned *order)
-{
-    unsigned start[BF__BINS], sum = 0;
-    int most = BF__BINS / field->phases, slabs = 1 + (int)(3 * field->bytes / BF__CACHE), bin;
-    size_t n;
-    if (slabs > most) slabs = most;
-    memset(start, 0, sizeof start);
-    for (n = 0; n < count; n++)
-        start[bf__bin(field, points_mm[3 * n + 2], phases[phase_count == 1 ? 0 : n], slabs)]++;
-    for (bin = 0; bin < slabs * field->phases; bin++) {
-        unsigned here = start[bin];
-        start[bin] = sum;
-        sum += here;
-    }
-    for (n = 0; n < count; n++)
-        order[start[bf__bin(field, points_mm[3 * n + 2], phases[phase_count == 1 ? 0 : n], slabs)]++] =
-            (unsigned)n;
-}
-
-static void bf__fetch(const void *address)
-{
-#ifdef __GNUC__
-    __builtin_prefetch(address);
-#else
-    (void)address;
-#endif
-}
-
 static double bf__height(const bf_fixture_part *law, double distance_mm)
 {
     double q = law->side == 0 ? fabs(distance_mm) : law->side * distance_mm, s, power = 1;
@@ -1246,42 +1207,6 @@ bf_status bf_distance(const bf_field *field, int structure, const double point_m
     return BF_OK;
 }
 
-/* Whether all questions of a batch can be asked. */
-static bf_status bf__askable(size_t count, const double *points_mm, const double *phases, size_t phase_count)
-{
-    size_t n;
-    if (phase_count != 1 && phase_count != count) return BF_WRONG_SIZE;
-    for (n = 0; n < count; n++)
-        if (!bf__finite(points_mm + 3 * n, phases[phase_count == 1 ? 0 : n])) return BF_NOT_FINITE;
-    return BF_OK;
-}
-
-bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
-                       const double *phases, size_t phase_count, double *distances_mm,
-                       double *gradients, unsigned *scratch)
-{
-    size_t n;
-    bf_status status;
-    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
-    if (scratch && count > 0xffffffffu) return BF_WRONG_SIZE;
-    status = bf__askable(count, points_mm, phases, phase_count);
-    if (status != BF_OK) return status;
-    if (scratch) bf__sort(field, count, points_mm, phases, phase_count, scratch);
-    for (n = 0; n < count; n++) {
-        size_t one = scratch ? scratch[n] : n;
-        if (scratch && n + BF__AHEAD < count) {
-            size_t soon = scratch[n + BF__AHEAD];
-            bf__fetch(points_mm + 3 * soon);
-            bf__fetch(distances_mm + soon);
-            bf__fetch(gradients + 3 * soon);
-            if (phase_count > 1) bf__fetch(phases + soon);
-        }
-        distances_mm[one] = bf__at(field, structure, points_mm + 3 * one, phases[phase_count == 1 ? 0 : one],
-                                   gradients + 3 * one);
-    }
-    return status;
-}
-
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential)
 {
@@ -1307,21 +1232,220 @@ bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3],
     return BF_OK;
 }
 
-bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
-                    const double *phases, size_t phase_count, double *forces_n)
+/* ---- batches ---- */
+
+/* Whether all questions of a batch can be asked. */
+static bf_status bf__askable(size_t count, const double *points_mm, const double *phases, size_t phase_count)
 {
-    const bf_fixture_part *law;
-    double distance_mm, gradient[3];
     size_t n;
+    if (phase_count != 1 && phase_count != count) return BF_WRONG_SIZE;
+    for (n = 0; n < count; n++)
+        if (!bf__finite(points_mm + 3 * n, phases[phase_count == 1 ? 0 : n])) return BF_NOT_FINITE;
+    return BF_OK;
+}
+
+typedef struct {
+    const bf_field *field;
+    const bf_fixture_part *law; /* NULL where distances are asked for */
+    int structure;
+    size_t count;
+    const double *points_mm, *phases;
+    int many_phases;
+    double *first, *rest; /* forces; or distances, and gradients */
+    int slabs;            /* into which the grid is cut along z, where questions are sorted */
+} bf__batch;
+
+enum {
+    BF__FEW = 1024,        /* fewer questions than this are answered as they come */
+    BF__BINS = 4096,       /* into no more than this they are sorted */
+    BF__CACHE = 1 << 19,   /* bytes of coefficients that the questions of a bin may ask for */
+    BF__LINE = 64,         /* bytes that the processor reads at a time */
+    BF__MANY_LINES = 16    /* the most that are fetched ahead with one question */
+};
+
+/* Answer the question in a note (x, y, z, phase) in its place: distance and gradient, or force. */
+static void bf__answer(const bf__batch *batch, double note[4])
+{
+    double slope[3], distance = bf__at(batch->field, batch->structure, note, note[3], slope);
+    if (batch->law) {
+        bf__push(batch->law, distance, slope, note);
+    } else {
+        note[0] = distance;
+        memcpy(note + 1, slope, sizeof slope);
+    }
+}
+
+static double bf__when(const bf__batch *batch, size_t n) { return batch->phases[batch->many_phases ? n : 0]; }
+
+static void bf__note(const bf__batch *batch, size_t n, double note[4])
+{
+    memcpy(note, batch->points_mm + 3 * n, 3 * sizeof(double));
+    note[3] = bf__when(batch, n);
+}
+
+static void bf__write(const bf__batch *batch, size_t n, const double note[4])
+{
+    if (batch->law) {
+        memcpy(batch->first + 3 * n, note, 3 * sizeof(double));
+    } else {
+        batch->first[n] = note[0];
+        memcpy(batch->rest + 3 * n, note + 1, 3 * sizeof(double));
+    }
+}
+
+/* Whether questions follow one another, as far as a few pairs of them tell: then each finds in the
+ * cache what the last has read. */
+static int bf__follow(const bf__batch *batch)
+{
+    enum { PAIRS = 64 };
+    const bf_field *field = batch->field;
+    size_t n;
+    int far = 0, pair, axis;
+    for (pair = 0; pair < PAIRS; pair++) {
+        double way = 0, beats;
+        n = (batch->count - 2) / PAIRS * (size_t)pair;
+        for (axis = 0; axis < 3; axis++)
+            way += fabs(batch->points_mm[3 * n + 3 + axis] - batch->points_mm[3 * n + axis]) * field->per_mm[axis];
+        beats = bf__when(batch, n + 1) - bf__when(batch, n);
+        beats = fabs(beats - floor(beats + 0.5));
+        far += way > 4 || beats * field->phases > 2;
+    }
+    return far < PAIRS / 4;
+}
+
+/* Into which of the bins a question falls: by height first, then by phase. */
+static int bf__bin(const bf__batch *batch, size_t n)
+{
+    const bf_field *field = batch->field;
+    double turned, place = (batch->points_mm[3 * n + 2] - field->origin_mm[2]) * field->per_mm[2] / field->shape[2];
+    int slab = place > 0 ? place < 1 ? (int)(place * batch->slabs) : batch->slabs - 1 : 0;
+    return slab * field->phases + bf__interval(field, bf__when(batch, n), &turned);
+}
+
+static void bf__fetch(const void *address)
+{
+#ifdef __GNUC__
+    /* Not into the innermost cache, which is too small for it. */
+    __builtin_prefetch(address, 0, 2);
+#else
+    (void)address;
+#endif
+}
+
+/* Answer the notes of one bin, and bring meanwhile into the cache the coefficients that the next one
+ * will ask for: those of one more phase in the same slab. */
+static void bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_t count)
+{
+    const bf_field *field = batch->field;
+    int next = bin + 1 < batch->slabs * field->phases ? bin + 1 : bin;
+    int phase = (next % field->phases + 1) % field->phases, slab = next / field->phases;
+    size_t layer = sizeof(float) * (size_t)field->shape[0] * (size_t)field->shape[1], n;
+    size_t low = (size_t)slab * (size_t)field->shape[2] / (size_t)batch->slabs;
+    size_t high = ((size_t)slab + 1) * (size_t)field->shape[2] / (size_t)batch->slabs + 2;
+    const char *start = (const char *)field->structure[batch->structure].coefficients[phase];
+    size_t from, each;
+    if (high > (size_t)field->shape[2]) high = (size_t)field->shape[2];
+    from = (low ? low - 1 : 0) * layer;
+    each = count ? (high * layer - from) / BF__LINE / count + 1 : 0;
+    for (n = 0; n < count; n++) {
+        size_t line;
+        /* Where few ask, most of what would be brought is not asked for. */
+        if (each <= BF__MANY_LINES)
+            for (line = 0; line < each && from < high * layer; line++, from += BF__LINE) bf__fetch(start + from);
+        bf__answer(batch, notes + 4 * n);
+    }
+}
+
+/* Random questions, those about neighbouring coefficients after one another: a counting sort moves
+ * them into the notes and their answers back. Meanwhile the numbers of their bins lie where the
+ * answers will. */
+static void bf__answer_sorted(bf__batch *batch, double *notes)
+{
+    unsigned end[BF__BINS + 1];
+    int most = BF__BINS / batch->field->phases, stride = batch->law ? 3 : 1, bin, bins;
+    size_t wanted = 1 + 3 * batch->field->bytes / BF__CACHE, n;
+    batch->slabs = wanted < (size_t)most ? (int)wanted : most;
+    if (batch->slabs > batch->field->shape[2]) batch->slabs = batch->field->shape[2];
+    bins = batch->slabs * batch->field->phases;
+    memset(end, 0, sizeof end);
+    for (n = 0; n < batch->count; n++) {
+        bin = bf__bin(batch, n);
+        batch->first[stride * n] = bin;
+        end[bin + 1]++;
+    }
+    for (bin = 0; bin < bins; bin++) end[bin + 1] += end[bin];
+    /* From here to the loop's end, end[bin] is where the bin's next note goes. */
+    for (n = 0; n < batch->count; n++)
+        bf__note(batch, n, notes + 4 * (size_t)end[(int)batch->first[stride * n]]++);
+    for (bin = 0; bin < bins; bin++) {
+        size_t start = bin ? end[bin - 1] : 0;
+        bf__answer_bin(batch, bin, notes + 4 * start, end[bin] - start);
+    }
+    for (bin = bins; bin > 0; bin--) end[bin] = end[bin - 1];
+    end[0] = 0;
+    for (n = 0; n < batch->count; n++)
+        bf__write(batch, n, notes + 4 * (size_t)end[(int)batch->first[stride * n]]++);
+}
+
+static bf_status bf__answer_all(bf__batch *batch, double *scratch)
+{
+    size_t n;
+    if (scratch && batch->count > 0xffffffffu) return BF_WRONG_SIZE;
+    if (scratch && batch->count >= BF__FEW && !bf__follow(batch)) {
+        bf__answer_sorted(batch, scratch);
+        return BF_OK;
+    }
+    for (n = 0; n < batch->count; n++) {
+        const double *point_mm = batch->points_mm + 3 * n;
+        double slope[3], *to = batch->law ? slope : batch->rest + 3 * n;
+        double distance = bf__at(batch->field, batch->structure, point_mm, bf__when(batch, n), to);
+        if (batch->law) bf__push(batch->law, distance, slope, batch->first + 3 * n);
+        else batch->first[n] = distance;
+    }
+    return BF_OK;
+}
+
+bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
+                       const double *phases, size_t phase_count, double *distances_mm,
+                       double *gradients, double *scratch)
+{
+    bf__batch batch;
+    bf_status status;
+    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
+    status = bf__askable(count, points_mm, phases, phase_count);
+    if (status != BF_OK) return status;
+    batch.field = field;
+    batch.law = NULL;
+    batch.structure = structure;
+    batch.count = count;
+    batch.points_mm = points_mm;
+    batch.phases = phases;
+    batch.many_phases = phase_count > 1;
+    batch.first = distances_mm;
+    batch.rest = gradients;
+    batch.slabs = 1;
+    return bf__answer_all(&batch, scratch);
+}
+
+bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
+                    const double *phases, size_t phase_count, double *forces_n, double *scratch)
+{
+    bf__batch batch;
     bf_status status;
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
     status = bf__askable(count, points_mm, phases, phase_count);
-    law = &field->fixture[fixture];
-    for (n = 0; status == BF_OK && n < count; n++) {
-        distance_mm = bf__at(field, law->structure, points_mm + 3 * n, phases[phase_count == 1 ? 0 : n], gradient);
-        bf__push(law, distance_mm, gradient, forces_n + 3 * n);
-    }
-    return status;
+    if (status != BF_OK) return status;
+    batch.field = field;
+    batch.law = &field->fixture[fixture];
+    batch.structure = batch.law->structure;
+    batch.count = count;
+    batch.points_mm = points_mm;
+    batch.phases = phases;
+    batch.many_phases = phase_count > 1;
+    batch.first = forces_n;
+    batch.rest = NULL;
+    batch.slabs = 1;
+    return bf__answer_all(&batch, scratch);
 }
 
 void bf_transform(const double t[16], const double point_mm[3], double moved_mm[3])

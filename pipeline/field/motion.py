@@ -1,0 +1,64 @@
+"""How surfaces beat: what is known of them between the stored phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from pipeline.geometry import Float, Surface
+
+
+class BeatingSurface(Protocol):
+    """Anything that gives a closed surface for every stored phase."""
+
+    @property
+    def phases(self) -> Float:
+        """``(phase,)`` in [0, 1), rising."""
+
+    def at(self, index: int) -> Surface:
+        """The surface at stored phase number ``index``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A surface whose vertices are the same material points in every phase, at any phase.
+
+    Each vertex follows the periodic spline in time through its places at the stored phases: of the
+    fifth degree where there are phases enough, as it follows a heart more closely than the cubic.
+    """
+
+    path: Any
+    """Places ``(n, 3)`` at a phase, LPS mm."""
+
+    template: Surface
+    """The surface at the first phase."""
+
+    @classmethod
+    def of(cls, moving: BeatingSurface) -> Self | None:
+        """The motion; None where vertices do not correspond or phases are fewer than three."""
+        from scipy.interpolate import make_interp_spline
+
+        count = len(moving.phases)
+        each = [moving.at(index) for index in range(count)]
+        first = each[0]
+        same = all(
+            one.triangles is first.triangles or np.array_equal(one.triangles, first.triangles)
+            for one in each
+        )
+        if not same or count < 3:
+            return None
+        places = np.stack([one.vertices_mm for one in [*each, first]])
+        phases = np.append(moving.phases, moving.phases[0] + 1)
+        order = 5 if count >= 8 else 3
+        return cls(make_interp_spline(phases, places, k=order, bc_type="periodic"), first)
+
+    def at(self, phase: float) -> Surface:
+        """The surface at any phase."""
+        return Surface(np.asarray(self.path(phase)), self.template.triangles)
+
+
+def halfway(phases: Float) -> Float:
+    """Moments in the middle between stored phases, the last with the first of the next beat."""
+    return np.asarray(phases + np.diff(phases, append=phases[0] + 1) / 2)

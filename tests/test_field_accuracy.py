@@ -1,0 +1,108 @@
+"""How near the field's zero is to the moving surface, and how the force changes with place."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from field_baked import FIXTURES, SETTINGS, bake_small
+from field_shapes import box, sphere
+
+from data_synth.population import draw_heart
+from pipeline.field import BakeSettings, Fixture, ForceField
+from pipeline.field.bake import SurfaceSeries, bake_field
+from pipeline.field.exact import points_about
+from pipeline.field.store import verify_field
+from pipeline.geometry import MovingSurface, Surface
+
+BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
+
+
+def test_stiffness_off_the_medial_axis_is_the_laws_and_the_rate_on_it_is_within_its_bound(tmp_path):
+    """Truth: the law's slope, by its formula; the stated bound of the rate, 8 f_max / spacing."""
+    said = bake_small(tmp_path / "f.zarr")["fixtures"]
+    field = ForceField.open(tmp_path / "f.zarr")
+    rng = np.random.default_rng(3)
+    for name, one in said.items():
+        law = FIXTURES[name]
+        # The size of the force changes by f_max f'(q) times the gradient's length, and a spline
+        # through a kink overshoots the slope of 1 by less than a quarter.
+        ratio = one["stiffness_measured_n_per_m"] / law.stiffness_n_per_m
+        assert 0.9 < ratio < 1.25
+        bound = 8 * law.f_max_n / SETTINGS.spacing_mm + law.stiffness_n_per_m / 1000
+        assert one["force_rate_bound_n_per_mm"] == pytest.approx(bound)
+        # Steps of 1 um about the middle of the balls, which is their medial axis.
+        here = rng.uniform(-4, 4, (20_000, 3))
+        way = rng.normal(size=here.shape)
+        way *= 1e-3 / np.linalg.norm(way, axis=1, keepdims=True)
+        moments = rng.uniform(size=len(here))
+        change = field.force_n(here + way, moments, name) - field.force_n(here, moments, name)
+        rate = np.linalg.norm(change, axis=1).max() / 1e-3
+        assert max(rate, one["force_rate_max_n_per_mm"]) <= bound
+        if name == "guide":
+            assert rate > 5 * law.stiffness_n_per_m / 1000
+
+
+def test_on_the_medial_sheets_of_a_box_the_force_keeps_to_its_rate(tmp_path):
+    """Sheets along the axes and at 45 degrees to them, and their corners."""
+    moving = {"box": SurfaceSeries((box((-19, -17, -15), (18, 17, 16)),), np.array([0.0]))}
+    settings = BakeSettings(spacing_mm=2.5, samples=200)
+    bake_field(tmp_path / "f.zarr", moving, BOX_FIXTURE, settings)
+    field = ForceField.open(tmp_path / "f.zarr")
+    rng = np.random.default_rng(4)
+    law = BOX_FIXTURE["hold"]
+    bound = 8 * law.f_max_n / 2.5 + law.stiffness_n_per_m / 1000
+    here = rng.uniform(-16, 16, (200_000, 3))
+    way = rng.normal(size=here.shape)
+    way *= 1e-3 / np.linalg.norm(way, axis=1, keepdims=True)
+    change = np.linalg.norm(field.force_n(here + way, 0) - field.force_n(here, 0), axis=1)
+    assert bound / 8 < change.max() / 1e-3 <= bound
+
+
+def test_the_fit_brings_the_zero_to_the_surface(tmp_path):
+    """Truth: points of the surface that the fit was not given, at distance 0; far from the
+    surface nothing changes. The tips of the spheroid are curved by 8^2 / 20 = 3.2 mm."""
+    ball = sphere(1.0, 4)
+    surface = Surface(ball.vertices_mm * (20.0, 8.0, 8.0), ball.triangles)
+    moving = {"spheroid": SurfaceSeries((surface,), np.array([0.0]))}
+    fixtures = {"g": Fixture(structure="spheroid", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
+    fields = []
+    for rounds in (0, 12):
+        settings = BakeSettings(spacing_mm=4.0, samples=200, fit_rounds=rounds)
+        bake_field(tmp_path / f"{rounds}.zarr", moving, fixtures, settings)
+        verify_field(tmp_path / f"{rounds}.zarr")
+        fields.append(ForceField.open(tmp_path / f"{rounds}.zarr"))
+    asked = points_about(surface, np.random.default_rng(5), 4000, 0.0)
+    plain, fitted = (np.abs(field.distance_mm(asked, 0)) for field in fields)
+    assert fitted.max() < 0.7 * plain.max()
+    assert np.percentile(fitted, 99) < 0.7 * np.percentile(plain, 99)
+
+    nodes_mm = fields[0].grid.nodes_mm().reshape(-1, 3)
+    moved = np.abs(fields[1].distance_mm(nodes_mm, 0) - fields[0].distance_mm(nodes_mm, 0))
+    away = np.abs(fields[0].stored_distance_mm("spheroid", 0)).reshape(-1)
+    # A point's nodes are 1.5 steps away along each axis at most, and reach as far again.
+    assert moved[away > 4.0 * 3 * math.sqrt(3)].max() == 0
+    stated = json.loads((tmp_path / "12.zarr" / "zarr.json").read_text())
+    stated_mm = stated["attributes"]["beatfield"]["structures"]["spheroid"]["correction_mm"]
+    assert 0 < moved.max() <= stated_mm
+
+
+def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
+    """Truth: the phantom's left ventricle midway between 25 phases, which nothing was given."""
+    heart = draw_heart(np.random.default_rng(5))
+    phases = np.arange(25) / 25
+    each = [heart.surfaces(float(phase))["epicardium"] for phase in phases]
+    moving = MovingSurface(np.stack([one[0] for one in each]), each[0][1], phases)
+    fixture = Fixture(structure="epicardium", kind="guidance", delta_mm=8.0, f_max_n=1.0)
+    said = bake_field(
+        tmp_path / "f.zarr", {"epicardium": moving}, {"g": fixture}, BakeSettings(samples=100)
+    )
+    field = ForceField.open(tmp_path / "f.zarr")
+    off = []
+    for moment in (phases + 0.02)[::4]:
+        vertices_mm, _ = heart.surfaces(float(moment))["epicardium"]
+        off.append(np.abs(field.distance_mm(vertices_mm, moment)))
+    off_mm = np.concatenate(off)
+    assert np.percentile(off_mm, 99.9) < 0.1
+    assert off_mm.max() < 0.15
+    assert said["drift_max_mm"] == pytest.approx(off_mm.max(), rel=0.5)
