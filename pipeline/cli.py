@@ -220,7 +220,7 @@ def query(
     field: Path,
     /,
     *,
-    point: tuple[float, float, float],
+    point: Annotated[tuple[float, float, float], Parameter(negative="")],
     phase: float,
     fixture: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
@@ -234,7 +234,7 @@ def query(
     point
         X Y Z in LPS mm of the MR frame.
     phase
-        Place in the heartbeat, [0, 1), 0 at the R peak.
+        Share of the heartbeat since the R peak; only its fraction counts: 1.25 is 0.25.
     fixture
         Only this fixture; all of them without it.
     as_json
@@ -248,9 +248,17 @@ def query(
         force = " ".join(f"{value:+.4f}" for value in answer["force_n"])
         print(
             f"{name}: distance {answer['distance_mm']:+.3f} mm, "
-            f"potential {answer['potential']:.4f}, force {force} N"
+            f"potential {answer['potential']:.4f}, force {force} N{_limits(answer)}"
         )
     return 0
+
+
+def _limits(answer: dict[str, Any]) -> str:
+    """What a device has to follow: how fast the force changes, and how stiff the fixture is."""
+    rate, allowed = answer["force_rate_n_per_ms"], answer["stiffness_limit_n_per_m"]
+    changing = "" if rate is None else f", changing by {rate:.4f} N/ms"
+    most = "" if allowed is None else f" of {allowed:.0f}"
+    return f"{changing}, stiffness {answer['stiffness_n_per_m']:.0f}{most} N/m"
 
 
 def _ask(
@@ -259,8 +267,6 @@ def _ask(
     """Distance, potential and force of one fixture, or of all."""
     from pipeline.field.query import query_point
 
-    if not 0 <= phase < 1:
-        raise InputError(f"--phase {phase:g}: lies outside [0, 1); 0 is the R peak")
     answers = query_point(path, point, phase, fixture)
     if not all(answer["inside_grid"] for answer in answers.values()):
         where = " ".join(f"{value:g}" for value in point)
@@ -312,6 +318,33 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
     from pipeline.field.export import export_field
 
     print(f"exported  {export_field(field, to, out)}")
+    return 0
+
+
+@app.command
+def rpeaks(record: Path, /, *, out: Path) -> int:
+    """Find the R peaks of an electrocardiogram, as a stream would show them.
+
+    Writes a row for each beat: R time in seconds (on the recording's clock), kind (normal, ectopic,
+    irregular), whether the heart's phase could be relied on, the best lead, the RR interval, how
+    much the beat resembles the others, and when it became known.
+
+    Parameters
+    ----------
+    record
+        A WFDB record (its path with or without ending), a .csv table or a DICOM waveform file.
+    out
+        CSV file to write.
+    """
+    from pipeline.imaging.ecg import read_ecg
+    from pipeline.registration.rhythm import read_rhythm, write_rhythm
+
+    ecg = read_ecg(record, gaps=True)
+    beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)
+    write_rhythm(out, beats, ecg.leads, ecg.start_s)
+    counts = {kind: sum(beat.kind == kind for beat in beats) for kind in ("ectopic", "irregular")}
+    print(f"beats     {len(beats)}, " + ", ".join(f"{n} {kind}" for kind, n in counts.items()))
+    print(f"table     {out}")
     return 0
 
 

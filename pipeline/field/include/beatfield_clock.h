@@ -1,0 +1,386 @@
+/* beatfield_clock.h - the phase of a beating heart now, from its past R peaks, in C99 or C++11.
+ *
+ * In one source file of a program:
+ *
+ *     #define BEATFIELD_CLOCK_IMPLEMENTATION
+ *     #include "beatfield_clock.h"
+ *
+ * and everywhere else just the #include. No library is needed but libm; nothing is allocated.
+ *
+ *     bf_clock clock = bf_new_clock(field.rr_s, 10.0 / field.fixture[0].f_max_n);  10 N/s at most
+ *     bf_beat(&clock, r_s, 0);                       whenever an R peak becomes known
+ *     bf_tick now;
+ *     bf_now(&clock, time_s, lead_connected, &now);  in every turn of the loop
+ *     bf_force(&field, 0, point_mm, now.phase, force_n);
+ *     for (int i = 0; i < 3; i++) force_n[i] *= now.fade;
+ *
+ * Times are seconds on one clock that never runs back. Phases are those of one nominal beat, of the
+ * length the field was baked for: systole keeps its length when the rate changes (Weissler, Harris
+ * and Schoenfeld, Circulation 37:149-159, 1968), atria contract 120 ms before R, diastole gives way.
+ * The phase does not jump where it is valid: it is corrected by running at half to one and a half
+ * times its speed. What pipeline.registration.clock says in Python, this says with the same numbers.
+ * One clock belongs to one thread.
+ */
+#ifndef BEATFIELD_CLOCK_H
+#define BEATFIELD_CLOCK_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define BF_CLOCK_KEPT 16
+
+/* Lost: no lead, no rhythm yet, or a beat is overdue. Ectopic: a beat came early or looks unlike the
+ * others, and no regular interval has passed since. Fibrillating: intervals have no order. */
+typedef enum { BF_LOST, BF_REGULAR, BF_ECTOPIC, BF_FIBRILLATING } bf_rhythm;
+
+typedef enum {
+    BF_NO_BEAT = -1, /* no later than the last one: it does not count */
+    BF_NORMAL_BEAT,
+    BF_ECTOPIC_BEAT,
+    BF_IRREGULAR_BEAT
+} bf_beat_kind;
+
+typedef struct {
+    double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
+    double now_s;
+    int started;
+    double phase, sd;
+    bf_rhythm rhythm;
+    int valid;
+    double fade;
+    double last_r_s;
+    double beats;
+    double rr_s, spread_s; /* predicted interval, and how far predictions are off */
+    int good, needed;      /* regular intervals in succession, and how many make a rhythm */
+    long count;
+    int gap;               /* beats may have been missed since the last one */
+    double interval_s[BF_CLOCK_KEPT];
+    int regular[BF_CLOCK_KEPT]; /* 1, 0, or -1 for a beat of another shape */
+} bf_clock;
+
+typedef struct {
+    double phase;     /* [0, 1) of the nominal beat, 0 at R */
+    double sd;        /* its standard deviation */
+    bf_rhythm rhythm;
+    int valid;        /* whether the phase can be relied on */
+    double fade;      /* share of the force to render, in [0, 1] */
+} bf_tick;
+
+/* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. */
+bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
+
+/* An R peak became known, at the latest 0.15 s after it; strange: its shape is unlike the others'. */
+bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
+
+/* Phase now; usable: some lead is connected. Returns 0, or -1 when the time is no number or lies
+ * before the last one: then nothing changes and the tick repeats the last. */
+int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
+
+/* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. */
+double bf_to_cycle(double phase, double rr_s, double cycle_rr_s);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* BEATFIELD_CLOCK_H */
+
+#ifdef BEATFIELD_CLOCK_IMPLEMENTATION
+#undef BEATFIELD_CLOCK_IMPLEMENTATION
+
+#include <math.h>
+#include <string.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define BFC_PI 3.14159265358979323846
+#define BFC_LATENCY_S 0.15
+#define BFC_R_SD_S 0.002
+#define BFC_REGULAR 0.10
+#define BFC_MOST 0.17
+#define BFC_CLOSE 0.02
+#define BFC_MOST_SD 0.05
+#define BFC_SLOWEST 0.5
+#define BFC_QUICKEST 1.5
+#define BFC_IRREGULAR 0.075
+#define BFC_ORDERLY 0.05
+
+static double bfc_min(double a, double b) { return b < a ? b : a; }
+static double bfc_max(double a, double b) { return b > a ? b : a; }
+
+static double bfc_systole_share(double rr_s)
+{
+    double rate = bfc_min(bfc_max(60.0 / rr_s, 45.0), 120.0);
+    double length_s = 0.5475 - 0.00205 * rate - 0.04;
+    return length_s * bfc_min(1.0, rr_s * 120.0 / 60.0) / rr_s;
+}
+
+static double bfc_kick(double rr_s) { return 1.0 - 0.12 / bfc_max(rr_s, 60.0 / 120.0); }
+
+double bf_to_cycle(double phase, double rr_s, double cycle_rr_s)
+{
+    double from_end, from_kick, to_end, to_kick, a, b, sine, place;
+    if (rr_s == cycle_rr_s)
+        return phase;
+    from_end = 1.0 / tan(BFC_PI * bfc_systole_share(rr_s));
+    from_kick = 1.0 / tan(BFC_PI * bfc_kick(rr_s));
+    to_end = 1.0 / tan(BFC_PI * bfc_systole_share(cycle_rr_s));
+    to_kick = 1.0 / tan(BFC_PI * bfc_kick(cycle_rr_s));
+    b = (to_end - to_kick) / (from_end - from_kick);
+    a = to_end - b * from_end;
+    sine = sin(BFC_PI * phase);
+    place = atan2(sine, a * sine + b * cos(BFC_PI * phase)) / BFC_PI;
+    return place < 1.0 ? place : 0.0;
+}
+
+static double bfc_wrapped(double turns) { return turns - floor(turns + 0.5); }
+
+bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
+{
+    bf_clock clock;
+    memset(&clock, 0, sizeof clock);
+    clock.rhythm = BF_LOST;
+    clock.cycle_rr_s = cycle_rr_s;
+    clock.fade_per_s = fade_per_s;
+    clock.rr_s = cycle_rr_s;
+    clock.spread_s = 0.05 * cycle_rr_s;
+    clock.needed = 3;
+    return clock;
+}
+
+static double bfc_tolerance(const bf_clock *c)
+{
+    return bfc_min(bfc_max(BFC_REGULAR * c->rr_s, 3.0 * c->spread_s), BFC_MOST * c->rr_s);
+}
+
+static int bfc_slot(const bf_clock *c, int back)
+{
+    return (int)((c->count - 1 - back + BF_CLOCK_KEPT) % BF_CLOCK_KEPT);
+}
+
+static double bfc_interval(const bf_clock *c, int back) { return c->interval_s[bfc_slot(c, back)]; }
+
+static int bfc_was_regular(const bf_clock *c, int back) { return c->regular[bfc_slot(c, back)] > 0; }
+
+/* Whether the last three intervals agree, so that a new rate has come to stay. */
+static int bfc_settled(const bf_clock *c)
+{
+    double low, high;
+    int back;
+    if (c->count < 3)
+        return 0;
+    low = high = bfc_interval(c, 0);
+    for (back = 0; back < 3; back++) {
+        if (c->regular[bfc_slot(c, back)] < 0)
+            return 0;
+        low = bfc_min(low, bfc_interval(c, back));
+        high = bfc_max(high, bfc_interval(c, back));
+    }
+    return high - low <= BFC_REGULAR * high;
+}
+
+/* Whether an interval lies between two beats of the usual shape. */
+static int bfc_own(const bf_clock *c, int count, int back)
+{
+    int before = back + 1 < count && c->regular[bfc_slot(c, back + 1)] < 0;
+    return !before && c->regular[bfc_slot(c, back)] >= 0;
+}
+
+/* Size that a third of the steps between intervals `lag` apart stay under. */
+static double bfc_usual_step(const bf_clock *c, int count, int lag)
+{
+    double steps[10];
+    int used = 0, i, j;
+    for (i = 0; i < count - lag; i++) {
+        double step = fabs(bfc_interval(c, i) - bfc_interval(c, i + lag));
+        if (!bfc_own(c, count, i) || !bfc_own(c, count, i + lag))
+            continue;
+        for (j = used++; j > 0 && steps[j - 1] > step; j--)
+            steps[j] = steps[j - 1];
+        steps[j] = step;
+    }
+    return used < 4 ? 0.0 : steps[35 * (used - 1) / 100];
+}
+
+static double bfc_irregularity(const bf_clock *c)
+{
+    int count = c->count < 10 ? (int)c->count : 10, back;
+    double mean = 0.0;
+    if (count < 7)
+        return 0.0;
+    for (back = 0; back < count; back++)
+        mean += bfc_interval(c, back) / count;
+    return bfc_min(bfc_usual_step(c, count, 1), bfc_usual_step(c, count, 2)) / mean;
+}
+
+/* The next interval: what two before it say, by the latest regular ones (least squares). */
+static void bfc_predict(bf_clock *c)
+{
+    int count = c->count < BF_CLOCK_KEPT ? (int)c->count : BF_CLOCK_KEPT, back;
+    double mean = 0.0, used = 0.0, s11, s12 = 0.0, s22, s1y = 0.0, s2y = 0.0, one, two, step;
+    for (back = 0; back < count; back++) {
+        if (bfc_was_regular(c, back)) {
+            mean += bfc_interval(c, back);
+            used += 1.0;
+        }
+    }
+    if (used == 0.0)
+        return;
+    mean /= used;
+    s11 = s22 = 2.0 * (0.01 * mean) * (0.01 * mean);
+    for (back = 0; back < count - 2; back++) {
+        if (bfc_was_regular(c, back) && bfc_was_regular(c, back + 1) &&
+            bfc_was_regular(c, back + 2)) {
+            double y = bfc_interval(c, back) - mean;
+            one = bfc_interval(c, back + 1) - mean;
+            two = bfc_interval(c, back + 2) - mean;
+            s11 += one * one;
+            s12 += one * two;
+            s22 += two * two;
+            s1y += one * y;
+            s2y += two * y;
+        }
+    }
+    one = bfc_was_regular(c, 0) ? bfc_interval(c, 0) - mean : 0.0;
+    two = count > 1 && bfc_was_regular(c, 1) ? bfc_interval(c, 1) - mean : 0.0;
+    step = ((s1y * s22 - s2y * s12) * one + (s2y * s11 - s1y * s12) * two) / (s11 * s22 - s12 * s12);
+    c->rr_s = mean + bfc_min(bfc_max(step, -0.2 * mean), 0.2 * mean);
+}
+
+/* What the rhythm is with its latest interval, and when the next beat is due. */
+static void bfc_judge(bf_clock *c, int regular, double off_s)
+{
+    int steady = bfc_settled(c), back;
+    double share;
+    if (!regular && steady) {
+        for (back = 0; back < BF_CLOCK_KEPT; back++)
+            c->regular[bfc_slot(c, back)] = back < 3;
+    }
+    if (regular && c->count > 3)
+        c->spread_s = sqrt(0.8 * c->spread_s * c->spread_s + 0.2 * off_s * off_s);
+    c->good = regular || steady ? c->good + 1 : 0;
+    share = bfc_irregularity(c);
+    if (share > BFC_IRREGULAR || (c->rhythm == BF_FIBRILLATING && share > BFC_ORDERLY)) {
+        c->rhythm = BF_FIBRILLATING;
+        c->needed = 3;
+        c->good = 0;
+    } else if (c->good >= c->needed) {
+        c->rhythm = BF_REGULAR;
+        c->needed = 1;
+    } else if (!(regular || steady)) {
+        c->rhythm = BF_ECTOPIC;
+    }
+    if (c->rhythm != BF_REGULAR)
+        c->valid = 0;
+    bfc_predict(c);
+}
+
+bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
+{
+    double rr_s, off_s;
+    int known, regular, early, place;
+    if (!isfinite(r_s) || (c->beats > 0.0 && !(r_s > c->last_r_s)))
+        return BF_NO_BEAT;
+    rr_s = r_s - c->last_r_s;
+    c->last_r_s = r_s;
+    c->beats += 1.0;
+    if (c->beats < 2.0 || c->gap) {
+        c->gap = 0;
+        return BF_NORMAL_BEAT;
+    }
+    off_s = rr_s - c->rr_s;
+    known = c->count >= 3;
+    if (known)
+        regular = fabs(off_s) <= bfc_tolerance(c);
+    else
+        regular = c->count == 0 || fabs(rr_s - bfc_interval(c, 0)) <= BFC_MOST * rr_s;
+    regular = regular && !strange;
+    early = strange || (known && off_s < -bfc_tolerance(c));
+    place = (int)(c->count % BF_CLOCK_KEPT);
+    c->interval_s[place] = rr_s;
+    c->regular[place] = strange ? -1 : regular;
+    c->count += 1;
+    bfc_judge(c, regular, off_s);
+    if (c->rhythm == BF_FIBRILLATING)
+        return BF_IRREGULAR_BEAT;
+    return early ? BF_ECTOPIC_BEAT : BF_NORMAL_BEAT;
+}
+
+/* Where the heart should be, if the interval is rr_s and the next beats come as due. */
+static double bfc_place(const bf_clock *c, double now_s, double rr_s)
+{
+    double turns = (now_s - c->last_r_s) / rr_s;
+    return bf_to_cycle(turns - floor(turns), rr_s, c->cycle_rr_s);
+}
+
+/* Notice that no lead shows anything, or that a beat is overdue. */
+static void bfc_watch(bf_clock *c, double now_s, int usable)
+{
+    double waited_s = now_s - c->last_r_s;
+    if (!usable || c->beats < 1.0 || waited_s > 3.0 * c->rr_s) {
+        c->rhythm = BF_LOST;
+        c->needed = 3;
+        c->good = 0;
+        c->valid = 0;
+        c->gap = 1;
+    } else if (waited_s > c->rr_s + bfc_tolerance(c) + BFC_LATENCY_S) {
+        c->rhythm = c->rhythm == BF_REGULAR ? BF_LOST : c->rhythm;
+        c->good = 0;
+        c->valid = 0;
+    }
+}
+
+/* Move the phase towards where the beats say, and judge it. */
+static void bfc_turn(bf_clock *c, double before_s, double now_s)
+{
+    double place = bfc_place(c, now_s, c->rr_s), own = bfc_place(c, before_s, c->rr_s);
+    double turns = floor((now_s - c->last_r_s) / c->rr_s) - floor((before_s - c->last_r_s) / c->rr_s);
+    double natural = place - own + turns, off, h, by_interval, by_peak, near_enough;
+    if (c->fade == 0.0 && !c->valid) {
+        c->phase = place;
+    } else {
+        double step = natural + bfc_wrapped(place - c->phase - natural);
+        c->phase += bfc_min(bfc_max(step, BFC_SLOWEST * natural), BFC_QUICKEST * natural);
+        c->phase -= floor(c->phase);
+    }
+    off = bfc_wrapped(c->phase - place);
+    h = bfc_max(c->spread_s, 1e-4);
+    by_interval = 0.5 * c->spread_s / h *
+                  bfc_wrapped(bfc_place(c, now_s, c->rr_s - h) - bfc_place(c, now_s, c->rr_s + h));
+    by_peak = BFC_R_SD_S / c->rr_s;
+    c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
+    near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
+    c->valid = c->rhythm == BF_REGULAR && c->good >= c->needed && c->sd <= BFC_MOST_SD &&
+               fabs(off) <= near_enough;
+}
+
+int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
+{
+    int wrong = !isfinite(now_s) || (c->started && now_s < c->now_s);
+    if (!wrong) {
+        double passed_s = c->started ? now_s - c->now_s : 0.0;
+        double reach = c->fade_per_s * passed_s;
+        c->started = 1;
+        c->now_s = now_s;
+        bfc_watch(c, now_s, usable);
+        bfc_turn(c, now_s - passed_s, now_s);
+        c->fade += bfc_min(bfc_max((double)c->valid - c->fade, -reach), reach);
+    }
+    if (tick) {
+        tick->phase = c->phase;
+        tick->sd = c->sd;
+        tick->rhythm = c->rhythm;
+        tick->valid = c->valid;
+        tick->fade = c->fade;
+    }
+    return wrong ? -1 : 0;
+}
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* BEATFIELD_CLOCK_IMPLEMENTATION */

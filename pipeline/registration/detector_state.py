@@ -1,0 +1,79 @@
+"""What the R-peak detector keeps between samples, as arrays that compiled code can hold."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pipeline.geometry import Float, Integer
+
+# Rows of found beats.
+TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, FIELDS = range(7)
+# Columns of the state of a lead.
+(
+    LEVEL, NOISE, FLOOR, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
+    SIGN, SCATTER, LEAD_FIELDS,
+) = range(16)  # fmt: skip
+# Counters.
+(
+    SEEN,
+    BEST_AT,
+    LAST_BEAT,
+    FOUND,
+    WAITING,
+    INTERVALS,
+    STRANGE,
+    LEARNT,
+    LEARN_AT,
+    USABLE,
+    BEATS,
+    COUNTERS,
+) = range(12)
+# Numbers.
+BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, NUMBERS = range(5)
+KEPT_INTERVALS, KEPT_WAVES = 8, 64
+SHAPE_POINTS = 21
+"""Places about R at which shapes are compared."""
+
+
+class Plan(NamedTuple):
+    """What a sampling rate fixes, in samples."""
+
+    rate_hz: float
+    length: int
+    """Samples that the rings hold."""
+    half: int
+    """Half the wavelet's width."""
+    mean: int
+    """Half the width of the mean that follows it."""
+    confirm: int
+    """How long a wave must stay the highest."""
+    learn: int
+    """How much is seen before the first decision."""
+
+
+class State(NamedTuple):
+    """Everything that changes while samples come in."""
+
+    even: Float
+    odd: Float
+    coarse: Float
+    """Kernels ``(taps,)``: the wavelet's two parts, and two smoothings for timing."""
+    fine: Float
+    raw: Float
+    """``(leads, 2 length)``."""
+    power: Float
+    """``(leads, 2 length)`` squared envelope."""
+    energy: Float
+    """``(leads, length)`` root of its mean."""
+    fused: Float
+    """``(length,)`` energy of all leads in units of a beat."""
+    waves: Float
+    """``(KEPT_WAVES, 2)`` sample and height of waves since the last beat that were no beats."""
+    intervals: Float
+    """``(KEPT_INTERVALS,)`` latest RR intervals in samples."""
+    leads: Float
+    shapes: Float
+    """``(leads, SHAPE_POINTS)`` usual shape of a beat."""
+    found: Float
+    counters: Integer
+    numbers: Float

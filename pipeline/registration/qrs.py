@@ -1,0 +1,325 @@
+"""Which waves of a running electrocardiogram are beats: the compiled detector.
+
+The design is that of J. Pan and W. J. Tompkins, "A real-time QRS detection algorithm", IEEE Trans
+Biomed Eng 32 (1985) 230-236, with the rules of P. Hamilton, "Open source ECG analysis", Comput
+Cardiol 29 (2002) 101-104: energy in the band of the QRS complex, levels of beats and of noise with
+a threshold between them, a second look at half the threshold when a beat is overdue, and a bar for
+T waves. Three things differ. The energy is the envelope of one complex wavelet (a Gaussian's second
+derivative and its Hilbert transform), which does not depend on polarity and weighs a T wave as high
+as R with a sixth. Leads add up, each in units of its own beats, weighted by how far those stand out
+of what lies between (inverse variance), so a lead that is lost or noisy has no say. And all is
+reckoned in seconds: sampling rates differ in nothing but the number of samples.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.registration.compiled import compiled
+from pipeline.registration.detector_state import (
+    BAD_UNTIL,
+    BEATS,
+    BEST,
+    BEST_AT,
+    BETWEEN,
+    FLOOR,
+    FOUND,
+    HEIGHT,
+    INTERVALS,
+    JUMPED,
+    KEPT_INTERVALS,
+    KEPT_WAVES,
+    KNOWN,
+    LAST,
+    LAST_BEAT,
+    LAST_HEIGHT,
+    LATE,
+    LEARN_AT,
+    LEARNT,
+    LEVEL,
+    NOISE,
+    RUN,
+    SEEN,
+    SIZE,
+    USABLE,
+    USUAL_RR,
+    WAITING,
+    WEIGHT,
+    Plan,
+    State,
+)
+from pipeline.registration.waves import time_beat
+
+REFRACTORY_S = 0.20
+T_WAVE_S = 0.36
+"""Until so long after a beat a wave of less than half its energy is that beat's T wave."""
+LATE_T_WAVE_S = 0.45
+"""The same when a beat is overdue, for then the heart is slow and its T waves are late."""
+THRESHOLD = 0.3
+"""Place of the threshold between the levels of noise (0) and of beats (1)."""
+PATIENCE_S = 0.3
+"""A low wave is taken for a missed beat no sooner: it may be the P wave of a beat to come."""
+OVERDUE = 1.5
+"""A beat is overdue after so many mean RR intervals."""
+KNOCK = 8.0
+"""Energy, in units of a lead's beats, that no beat has."""
+RUN_S = 0.12
+"""A lead that repeats one value for so long shows nothing."""
+SETTLE_S = 0.2
+
+
+@compiled
+def feed(block: Float, plan: Plan, s: State) -> None:
+    """Take ``(n, leads)`` samples; beats that became known are rows of ``s.found``."""
+    s.counters[FOUND] = 0
+    for row in range(len(block)):
+        _store(block[row], plan, s)
+        now = s.counters[SEEN]
+        s.counters[SEEN] = now + 1
+        middle = now - plan.half - plan.mean
+        if middle < 0:
+            continue
+        if s.counters[LEARNT]:
+            _decide(middle, plan, s)
+        elif now - s.counters[LEARN_AT] >= plan.learn:
+            _learn(middle, plan, s)
+
+
+@compiled
+def _store(sample: Float, plan: Plan, s: State) -> None:
+    """Put one sample of every lead into the rings, and filter."""
+    now, length = s.counters[SEEN], plan.length
+    at = now % length
+    for k in range(len(sample)):
+        lead, value = s.leads[k], sample[k]
+        if not math.isfinite(value):
+            value = lead[LAST]
+            lead[BAD_UNTIL] = now + SETTLE_S * plan.rate_hz
+        if now == 0:
+            s.raw[k, :] = value
+        else:
+            _watch(lead, value, now, plan.rate_hz)
+        lead[LAST] = value
+        s.raw[k, at] = value
+        s.raw[k, at + length] = value
+        _filter(k, now, plan, s)
+
+
+@compiled
+def _watch(lead: Float, value: float, now: int, rate_hz: float) -> None:
+    """Follow runs of one value. A run that begins or ends with a jump is a lead that came off."""
+    jumped = abs(value - lead[LAST]) > 0.1 * lead[SIZE]
+    if value == lead[LAST]:
+        lead[RUN] += 1
+        return
+    if lead[RUN] >= RUN_S * rate_hz and (jumped or lead[JUMPED] > 0.0):
+        lead[BAD_UNTIL] = now + SETTLE_S * rate_hz
+    lead[RUN] = 0
+    lead[JUMPED] = 1.0 if jumped else 0.0
+
+
+@compiled
+def _filter(k: int, now: int, plan: Plan, s: State) -> None:
+    """Power of the wavelet half its width ago, and its mean half a mean before that."""
+    half, length = plan.half, plan.length
+    start = (now - 2 * half) % length
+    even, odd = 0.0, 0.0
+    for j in range(2 * half + 1):
+        value = s.raw[k, start + j]
+        even += s.even[j] * value
+        odd += s.odd[j] * value
+    at = (now - half) % length
+    s.power[k, at] = even * even + odd * odd
+    s.power[k, at + length] = s.power[k, at]
+    start = (now - half - 2 * plan.mean) % length
+    total = 0.0
+    for j in range(2 * plan.mean + 1):
+        total += s.power[k, start + j]
+    s.energy[k, (now - half - plan.mean) % length] = math.sqrt(total / (2 * plan.mean + 1))
+
+
+@compiled
+def _learn(middle: int, plan: Plan, s: State) -> None:
+    """First levels, from all that has been seen; then decide about all of that."""
+    alive = False
+    first = max(0, middle - plan.learn)
+    for k in range(len(s.leads)):
+        seen = np.empty(middle - first + 1)
+        for i in range(first, middle + 1):
+            seen[i - first] = s.energy[k, i % plan.length]
+        seen.sort()
+        s.leads[k, LEVEL] = s.leads[k, FLOOR] = 0.8 * seen[-1]
+        s.leads[k, NOISE] = max(seen[int(0.7 * len(seen))], 0.02 * seen[-1])
+        alive = alive or seen[-1] > 0.0
+    s.counters[LEARN_AT] = s.counters[SEEN]
+    if not alive:
+        return
+    s.counters[LEARNT] = 1
+    # A record may begin with a beat; none is overdue yet.
+    s.counters[LAST_BEAT] = first - int(T_WAVE_S * plan.rate_hz)
+    for i in range(first, middle + 1):
+        _decide(i, plan, s)
+
+
+@compiled
+def _decide(i: int, plan: Plan, s: State) -> None:
+    """Look at the energy at sample ``i``: has a wave passed, is a beat overdue?"""
+    for k in range(len(s.leads)):
+        _follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
+    height = _height(i, plan, s)
+    s.fused[i % plan.length] = height
+    if height > s.numbers[BEST]:
+        s.numbers[BEST] = height
+        s.counters[BEST_AT] = i
+    elif i - s.counters[BEST_AT] >= plan.confirm:
+        at = s.counters[BEST_AT]
+        s.numbers[BEST] = -1.0
+        s.counters[BEST_AT] = i
+        if s.fused[at % plan.length] > s.fused[(at - 1) % plan.length]:
+            _judge(at, plan, s)
+    if i - s.counters[LAST_BEAT] > OVERDUE * s.numbers[USUAL_RR]:
+        _look_back(i, plan, s)
+
+
+@compiled
+def _follow_noise(lead: Float, energy: float, rate_hz: float) -> None:
+    """Track the energy that 7 samples in 10 stay under: QRS complexes take less than 3."""
+    step = 4.0 / rate_hz
+    lead[NOISE] *= 1.0 + 0.7 * step if energy > lead[NOISE] else 1.0 - 0.3 * step
+    lead[NOISE] = max(lead[NOISE], 0.02 * lead[LEVEL])
+
+
+@compiled
+def _height(i: int, plan: Plan, s: State) -> float:
+    """Energy of all leads that are connected at sample ``i``, 1 for a usual beat."""
+    total, weights, now = 0.0, 0.0, s.counters[SEEN]
+    usable = False
+    for k in range(len(s.leads)):
+        lead = s.leads[k]
+        flat = lead[RUN] >= RUN_S * plan.rate_hz
+        gone = now < lead[BAD_UNTIL]
+        usable = usable or not (gone or (flat and lead[JUMPED] > 0.0))
+        lead[WEIGHT] = 0.0
+        if flat or gone or lead[LEVEL] <= 0.0:
+            continue
+        contrast = min(lead[LEVEL] / lead[NOISE], 20.0)
+        lead[WEIGHT] = contrast * contrast
+        weights += lead[WEIGHT]
+        total += lead[WEIGHT] * min(s.energy[k, i % plan.length] / lead[LEVEL], 2.0)
+    s.counters[USABLE] = 1 if usable else 0
+    return total / weights if weights > 0.0 else 0.0
+
+
+@compiled
+def _judge(at: int, plan: Plan, s: State) -> None:
+    """Take the wave at a sample for a beat or not."""
+    since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
+    if since_s < REFRACTORY_S:
+        return
+    # Leads that turned out to be lost since then no longer count.
+    _refuse_knocks(at, plan, s)
+    height = _height(at, plan, s)
+    if _is_beat(since_s, height, 1.0, s):
+        _accept(at, height, 0.0, plan, s)
+        return
+    s.numbers[BETWEEN] += 0.125 * (min(height, 0.6) - s.numbers[BETWEEN])
+    kept = s.counters[WAITING] % KEPT_WAVES
+    s.waves[kept, 0], s.waves[kept, 1] = at, height
+    s.counters[WAITING] += 1
+
+
+@compiled
+def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
+    """Take the say from leads whose energy near a wave is beyond any beat's: they were knocked."""
+    for k in range(len(s.leads)):
+        lead, most = s.leads[k], 0.0
+        for i in range(at - plan.confirm, at + plan.confirm + 1):
+            most = max(most, s.energy[k, i % plan.length])
+        if most > KNOCK * lead[LEVEL] > 0.0:
+            lead[BAD_UNTIL] = max(lead[BAD_UNTIL], s.counters[SEEN] + 1.0)
+            # Should beats have become so much larger, they count after some of them.
+            lead[LEVEL] *= 1.3
+
+
+@compiled
+def _is_beat(since_s: float, height: float, share: float, s: State) -> bool:
+    """Whether a wave so long after a beat and so high exceeds a share of the threshold."""
+    between = s.numbers[BETWEEN]
+    late = share < 1.0
+    if since_s < (LATE_T_WAVE_S if late else T_WAVE_S) and height < 0.5 * min(
+        s.numbers[LAST_HEIGHT], 1.2
+    ):
+        return False
+    return bool(height > share * (between + THRESHOLD * (1.0 - between)))
+
+
+@compiled
+def _look_back(i: int, plan: Plan, s: State) -> None:
+    """A beat is overdue: take the highest wave since the last one, or lower the levels."""
+    best = -1
+    for k in range(min(s.counters[WAITING], KEPT_WAVES)):
+        since_s = (s.waves[k, 0] - s.counters[LAST_BEAT]) / plan.rate_hz
+        fits = since_s >= REFRACTORY_S and i - s.waves[k, 0] >= PATIENCE_S * plan.rate_hz
+        fits = fits and _is_beat(since_s, s.waves[k, 1], 0.5, s)
+        if fits and (best < 0 or s.waves[k, 1] > s.waves[best, 1]):
+            best = k
+    if best >= 0:
+        _accept(int(s.waves[best, 0]), s.waves[best, 1], 1.0, plan, s)
+        return
+    fall, slow = math.exp(-1.0 / plan.rate_hz), math.exp(-0.2 / plan.rate_hz)
+    for k in range(len(s.leads)):
+        # A lead that is off says nothing about how large its beats are.
+        if s.leads[k, WEIGHT] > 0.0:
+            s.leads[k, FLOOR] *= slow
+            s.leads[k, LEVEL] = max(s.leads[k, LEVEL] * fall, 0.2 * s.leads[k, FLOOR])
+
+
+@compiled
+def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
+    """A beat: time it, learn from it, and report it."""
+    _learn_interval(at, plan, s)
+    s.counters[LAST_BEAT] = at
+    s.numbers[LAST_HEIGHT] = height
+    kept = 0
+    for k in range(min(s.counters[WAITING], KEPT_WAVES)):
+        if s.waves[k, 0] > at:
+            s.waves[kept, 0], s.waves[kept, 1] = s.waves[k, 0], s.waves[k, 1]
+            kept += 1
+    s.counters[WAITING] = kept
+    for k in range(len(s.leads)):
+        _learn_level(s.leads[k], s.energy[k, at % plan.length], late)
+    row = s.found[s.counters[FOUND]]
+    row[KNOWN], row[HEIGHT], row[LATE] = s.counters[SEEN] - 1, height, late
+    time_beat(at, row, plan, s)
+    s.counters[FOUND] += 1
+
+
+@compiled
+def _learn_interval(at: int, plan: Plan, s: State) -> None:
+    interval = float(at - s.counters[LAST_BEAT])
+    s.counters[BEATS] += 1
+    if s.counters[BEATS] < 2 or interval > 3.0 * plan.rate_hz:
+        return
+    s.intervals[s.counters[INTERVALS] % KEPT_INTERVALS] = interval
+    s.counters[INTERVALS] += 1
+    count = min(s.counters[INTERVALS], KEPT_INTERVALS)
+    mean = 0.0
+    for k in range(count):
+        mean += s.intervals[k] / count
+    s.numbers[USUAL_RR] = mean
+
+
+@compiled
+def _learn_level(lead: Float, energy: float, late: float) -> None:
+    """Move the level of a lead's beats a little towards this one, in the logarithm."""
+    if energy <= 0.0:
+        return
+    if lead[LEVEL] <= 0.0:
+        lead[LEVEL], lead[NOISE] = energy, 0.2 * energy
+    elif lead[WEIGHT] > 0.0:
+        ratio = min(max(energy / lead[LEVEL], 0.5), 2.0)
+        lead[LEVEL] *= ratio ** (0.3 if late > 0.0 else 0.15)
+    lead[FLOOR] = lead[LEVEL]

@@ -1,0 +1,130 @@
+"""Detector and clock together, over a recording as over a stream: which beats, of what kind."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float
+from pipeline.registration.clock import Kind, PhaseClock
+from pipeline.registration.rpeaks import Beat, RPeakDetector, with_end_held
+
+NOMINAL_RR_S = 0.8
+# How often the clock is asked: often enough to see a lead come off for less than a beat.
+_STEP_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class RhythmBeat:
+    """One beat of a recording and what the clock made of it when it became known."""
+
+    time_s: float
+    """R time, seconds after the first sample."""
+
+    kind: Kind
+    """``ectopic``: it came early or its shape is unlike the others'; ``irregular``: while
+    intervals have no order, as in fibrillation."""
+
+    valid: bool
+    """Whether the phase could be relied on then."""
+
+    lead: int
+    """Number of the lead that showed it best."""
+
+    rr_s: float
+    """Interval since the beat before; not a number for the first."""
+
+    likeness: float
+    """Correlation of its shape with the usual one."""
+
+    known_s: float
+    """When it became known."""
+
+
+def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
+    """Run detector and clock over a recording, as a force server would.
+
+    Parameters
+    ----------
+    signal_mv
+        ``(n, leads)`` millivolts; the scale does not matter. Samples may be missing (not a number).
+    sampling_rate_hz
+        100 to 2000.
+
+    Raises
+    ------
+    InputError
+        When the rate is outside of that, or the signal is none.
+    """
+    if signal_mv.ndim != 2 or not len(signal_mv):
+        raise InputError(f"ECG: needs an array (samples, leads), got {signal_mv.shape}")
+    detector = RPeakDetector(sampling_rate_hz, signal_mv.shape[1])
+    clock = PhaseClock(NOMINAL_RR_S)
+    padded = with_end_held(signal_mv, sampling_rate_hz)
+    step = max(1, round(_STEP_S * sampling_rate_hz))
+    found: list[RhythmBeat] = []
+    for start in range(0, len(padded), step):
+        beats = detector.push(padded[start : start + step])
+        kinds = [clock.beat(beat.time_s, beat.strange) for beat in beats]
+        now_s = (min(start + step, len(padded)) - 1) / sampling_rate_hz
+        valid = clock.at(now_s, detector.usable).valid
+        for beat, kind in zip(beats, kinds, strict=True):
+            last_s = found[-1].time_s if found else math.nan
+            if kind is not None and beat.time_s <= (len(signal_mv) - 1) / sampling_rate_hz:
+                found.append(_row(beat, kind, valid, beat.time_s - last_s))
+    return found
+
+
+def _row(beat: Beat, kind: Kind, valid: bool, rr_s: float) -> RhythmBeat:
+    return RhythmBeat(beat.time_s, kind, valid, beat.lead, rr_s, beat.likeness, beat.known_s)
+
+
+def write_rhythm(
+    path: Path, beats: Sequence[RhythmBeat], leads: Sequence[str], start_s: float = 0.0
+) -> None:
+    """Write one row a beat as CSV; the file is there whole or not at all.
+
+    Parameters
+    ----------
+    path
+        File to write; one that is there is replaced.
+    leads
+        Their names.
+    start_s
+        Time of the first sample on the recording's own clock.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(["time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s"])
+            for one in beats:
+                table.writerow(_cells(one, leads, start_s))
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists"
+        ) from error
+
+
+def _cells(one: RhythmBeat, leads: Sequence[str], start_s: float) -> list[str]:
+    rr_s = "" if math.isnan(one.rr_s) else f"{one.rr_s:.5f}"
+    return [
+        f"{one.time_s + start_s:.5f}",
+        one.kind,
+        "1" if one.valid else "0",
+        leads[one.lead],
+        rr_s,
+        f"{one.likeness:.3f}",
+        f"{one.known_s + start_s:.5f}",
+    ]

@@ -1,0 +1,324 @@
+"""Where in the mechanical beat the heart is now, from R times alone: the compiled clock.
+
+``include/beatfield_clock.h`` says the same in C99, statement by statement. Numbers only; the
+meaning is told in ``clock``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.registration.compiled import compiled
+
+R_AFTER_Q_S = 0.04
+SLOWEST_BPM, FASTEST_BPM = 45.0, 120.0
+KICK_S = 0.12
+LATENCY_S = 0.15
+"""An R peak is known at most so long after it."""
+R_SD_S = 0.002
+KEPT = 16
+REGULAR_SHARE, MOST_SHARE = 0.10, 0.17
+"""A beat within this share of the predicted interval is regular; a rhythm that is less sure gets
+more room, up to the second."""
+CLOSE = 0.02
+"""Largest distance in phase from where the beats say for a phase to be valid."""
+MOST_SD = 0.05
+SLOWEST, QUICKEST = 0.5, 1.5
+"""The phase is corrected by running at no less and no more than so many times its own speed."""
+IRREGULAR, ORDERLY = 0.075, 0.05
+"""Step from interval to interval, as a share, which two thirds of the steps exceed where the rhythm
+has no order; and below which it has one again."""
+
+LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
+NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
+# Places of the state.
+(
+    CYCLE_RR, FADE_PER_S, NOW, STARTED, PHASE, SD, STATE, VALID, FADE, LAST_R, BEATS, RR, SPREAD,
+    GOOD, NEEDED, COUNT, GAP, RINGS,
+) = range(18)  # fmt: skip
+"""Behind it ``KEPT`` intervals, and of each whether it was regular: 1, 0, or -1 for a beat of
+another shape."""
+SIZE = RINGS + 2 * KEPT
+
+
+@compiled
+def systole_share(rr_s: float) -> float:
+    """Share of a beat from the R peak to the closure of the aortic valve."""
+    rate = min(max(60.0 / rr_s, SLOWEST_BPM), FASTEST_BPM)
+    length_s = 0.5475 - 0.00205 * rate - R_AFTER_Q_S
+    return length_s * min(1.0, rr_s * FASTEST_BPM / 60.0) / rr_s
+
+
+@compiled
+def kick_phase(rr_s: float) -> float:
+    """Share of a beat after which the atria contract, a fixed time before the next R peak."""
+    return 1.0 - KICK_S / max(rr_s, 60.0 / FASTEST_BPM)
+
+
+@compiled
+def to_cycle(phase: float, rr_s: float, cycle_rr_s: float) -> float:
+    """Phase of a beat of ``rr_s`` on the axis of a beat of ``cycle_rr_s``.
+
+    The circle of phases is mapped on itself so that R peak, end of systole and atrial contraction
+    fall on their own places: cot(pi q) = a + b cot(pi p), the Moebius map of the circle.
+    """
+    if rr_s == cycle_rr_s:
+        return phase
+    from_end = 1.0 / math.tan(math.pi * systole_share(rr_s))
+    from_kick = 1.0 / math.tan(math.pi * kick_phase(rr_s))
+    to_end = 1.0 / math.tan(math.pi * systole_share(cycle_rr_s))
+    to_kick = 1.0 / math.tan(math.pi * kick_phase(cycle_rr_s))
+    b = (to_end - to_kick) / (from_end - from_kick)
+    a = to_end - b * from_end
+    sine = math.sin(math.pi * phase)
+    place = math.atan2(sine, a * sine + b * math.cos(math.pi * phase)) / math.pi
+    return place if place < 1.0 else 0.0
+
+
+@compiled
+def wrapped(turns: float) -> float:
+    """The same angle in [-0.5, 0.5)."""
+    return turns - math.floor(turns + 0.5)
+
+
+@compiled
+def reset(c: Float, cycle_rr_s: float, fade_per_s: float) -> None:
+    """A clock that has seen nothing."""
+    for i in range(SIZE):
+        c[i] = 0.0
+    c[CYCLE_RR] = cycle_rr_s
+    c[FADE_PER_S] = fade_per_s
+    c[RR] = cycle_rr_s
+    c[SPREAD] = 0.05 * cycle_rr_s
+    c[NEEDED] = 3.0
+
+
+@compiled
+def tolerance(c: Float) -> float:
+    """How far from its predicted time a regular beat may come, seconds."""
+    return float(min(max(REGULAR_SHARE * c[RR], 3.0 * c[SPREAD]), MOST_SHARE * c[RR]))
+
+
+@compiled
+def _slot(c: Float, back: int) -> int:
+    return RINGS + int(c[COUNT] - 1.0 - back + KEPT) % KEPT
+
+
+@compiled
+def interval(c: Float, back: int) -> float:
+    """The interval ``back`` before the latest (0)."""
+    return float(c[_slot(c, back)])
+
+
+@compiled
+def _was_regular(c: Float, back: int) -> bool:
+    return bool(c[_slot(c, back) + KEPT] > 0.0)
+
+
+@compiled
+def beat(c: Float, r_s: float, strange: bool) -> int:
+    """An R peak became known; what kind of beat it is, or -1 if it is no later than the last."""
+    if not math.isfinite(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
+        return -1
+    rr_s = r_s - c[LAST_R]
+    c[LAST_R] = r_s
+    c[BEATS] += 1.0
+    if c[BEATS] < 2.0 or c[GAP] > 0.0:
+        c[GAP] = 0.0
+        return NORMAL_BEAT
+    off_s = rr_s - c[RR]
+    known = c[COUNT] >= 3.0
+    # Before a prediction can be trusted, intervals are held against one another.
+    first = c[COUNT] == 0.0 or abs(rr_s - interval(c, 0)) <= MOST_SHARE * rr_s
+    regular = not strange and (abs(off_s) <= tolerance(c) if known else first)
+    early = strange or (known and off_s < -tolerance(c))
+    place = int(c[COUNT]) % KEPT
+    c[RINGS + place] = rr_s
+    c[RINGS + KEPT + place] = -1.0 if strange else (1.0 if regular else 0.0)
+    c[COUNT] += 1.0
+    _judge(c, regular, off_s)
+    if c[STATE] == FIBRILLATING:
+        return IRREGULAR_BEAT
+    return ECTOPIC_BEAT if early else NORMAL_BEAT
+
+
+@compiled
+def _judge(c: Float, regular: bool, off_s: float) -> None:
+    """What the rhythm is with its latest interval, and when the next beat is due."""
+    steady = _settled(c)
+    if not regular and steady:
+        for back in range(KEPT):
+            c[_slot(c, back) + KEPT] = 1.0 if back < 3 else 0.0
+    if regular and c[COUNT] > 3.0:
+        c[SPREAD] = math.sqrt(0.8 * c[SPREAD] * c[SPREAD] + 0.2 * off_s * off_s)
+    c[GOOD] = c[GOOD] + 1.0 if regular or steady else 0.0
+    share = irregularity(c)
+    if share > IRREGULAR or (c[STATE] == FIBRILLATING and share > ORDERLY):
+        c[STATE], c[NEEDED], c[GOOD] = FIBRILLATING, 3.0, 0.0
+    elif c[GOOD] >= c[NEEDED]:
+        c[STATE], c[NEEDED] = REGULAR, 1.0
+    elif not (regular or steady):
+        c[STATE] = ECTOPIC
+    if c[STATE] != REGULAR:
+        c[VALID] = 0.0
+    _predict(c)
+
+
+@compiled
+def _settled(c: Float) -> bool:
+    """Whether the last three intervals agree, so that a new rate has come to stay."""
+    if c[COUNT] < 3.0:
+        return False
+    for back in range(3):
+        if c[_slot(c, back) + KEPT] < 0.0:
+            return False
+    one, two, three = interval(c, 0), interval(c, 1), interval(c, 2)
+    low, high = min(one, min(two, three)), max(one, max(two, three))
+    return high - low <= REGULAR_SHARE * high
+
+
+@compiled
+def irregularity(c: Float) -> float:
+    """Step between intervals, as a share of their mean, that two thirds of the last nine exceed.
+
+    Steps to the interval before and to the one before that are both looked at, and the smaller is
+    taken: beats of two kinds in turn have an order. Beats of another shape and the pauses after
+    them do not count.
+    """
+    count = int(min(c[COUNT], 10.0))
+    if count < 7:
+        return 0.0
+    mean = 0.0
+    for back in range(count):
+        mean += interval(c, back) / count
+    return min(_usual_step(c, count, 1), _usual_step(c, count, 2)) / mean
+
+
+@compiled
+def _own(c: Float, count: int, back: int) -> bool:
+    """Whether an interval lies between two beats of the usual shape."""
+    before = back + 1 < count and c[_slot(c, back + 1) + KEPT] < 0.0
+    return not (before or c[_slot(c, back) + KEPT] < 0.0)
+
+
+@compiled
+def _usual_step(c: Float, count: int, lag: int) -> float:
+    """Size that a third of the steps between intervals ``lag`` apart stay under."""
+    steps = np.empty(10)
+    used = 0
+    for i in range(count - lag):
+        if _own(c, count, i) and _own(c, count, i + lag):
+            steps[used] = abs(interval(c, i) - interval(c, i + lag))
+            used += 1
+    if used < 4:
+        return 0.0
+    return float(np.sort(steps[:used])[(35 * (used - 1)) // 100])
+
+
+@compiled
+def _predict(c: Float) -> None:
+    """The next interval: what two before it say, by the latest regular ones (least squares).
+
+    Two are enough for what breathing does, a sine of some beats' period; a small ridge draws the
+    answer to the mean where intervals hardly differ.
+    """
+    count = int(min(c[COUNT], float(KEPT)))
+    mean, used = 0.0, 0.0
+    for back in range(count):
+        if _was_regular(c, back):
+            mean += interval(c, back)
+            used += 1.0
+    if used == 0.0:
+        return
+    mean /= used
+    ridge = 2.0 * (0.01 * mean) * (0.01 * mean)
+    s11, s12, s22, s1y, s2y = ridge, 0.0, ridge, 0.0, 0.0
+    for back in range(count - 2):
+        if _was_regular(c, back) and _was_regular(c, back + 1) and _was_regular(c, back + 2):
+            y, one = interval(c, back) - mean, interval(c, back + 1) - mean
+            two = interval(c, back + 2) - mean
+            s11 += one * one
+            s12 += one * two
+            s22 += two * two
+            s1y += one * y
+            s2y += two * y
+    whole = s11 * s22 - s12 * s12
+    one = interval(c, 0) - mean if _was_regular(c, 0) else 0.0
+    two = interval(c, 1) - mean if count > 1 and _was_regular(c, 1) else 0.0
+    step = ((s1y * s22 - s2y * s12) * one + (s2y * s11 - s1y * s12) * two) / whole
+    c[RR] = mean + min(max(step, -0.2 * mean), 0.2 * mean)
+
+
+@compiled
+def _place(c: Float, now_s: float, rr_s: float) -> float:
+    """Where the heart should be, if the interval is ``rr_s`` and the next beats come as due."""
+    turns = (now_s - c[LAST_R]) / rr_s
+    return to_cycle(turns - math.floor(turns), rr_s, c[CYCLE_RR])
+
+
+@compiled
+def advance(c: Float, now_s: float, usable: bool) -> int:
+    """Bring the clock to ``now_s``; -1 when that is no time at or after the last.
+
+    Afterwards ``c`` holds phase, its standard deviation, state, validity and fade.
+    """
+    if not math.isfinite(now_s) or (c[STARTED] > 0.0 and now_s < c[NOW]):
+        return -1
+    passed_s = now_s - c[NOW] if c[STARTED] > 0.0 else 0.0
+    before_s = now_s - passed_s
+    c[STARTED], c[NOW] = 1.0, now_s
+    _watch(c, now_s, usable)
+    _turn(c, before_s, now_s)
+    reach = c[FADE_PER_S] * passed_s
+    c[FADE] += min(max(c[VALID] - c[FADE], -reach), reach)
+    return 0
+
+
+@compiled
+def _watch(c: Float, now_s: float, usable: bool) -> None:
+    """Notice that no lead shows anything, or that a beat is overdue."""
+    waited_s = now_s - c[LAST_R]
+    if not usable or c[BEATS] < 1.0 or waited_s > 3.0 * c[RR]:
+        c[STATE], c[NEEDED], c[GOOD], c[VALID] = LOST, 3.0, 0.0, 0.0
+        # How many beats were missed is unknown: the next one ends no interval.
+        c[GAP] = 1.0
+    elif waited_s > c[RR] + tolerance(c) + LATENCY_S:
+        # After an early beat comes a pause, and in fibrillation nothing is due.
+        c[STATE] = LOST if c[STATE] == REGULAR else c[STATE]
+        c[GOOD], c[VALID] = 0.0, 0.0
+
+
+@compiled
+def _turn(c: Float, before_s: float, now_s: float) -> None:
+    """Move the phase towards where the beats say, and judge it."""
+    place = _place(c, now_s, c[RR])
+    own = _place(c, before_s, c[RR])
+    turns = math.floor((now_s - c[LAST_R]) / c[RR]) - math.floor((before_s - c[LAST_R]) / c[RR])
+    natural = place - own + turns
+    if c[FADE] == 0.0 and c[VALID] == 0.0:
+        c[PHASE] = place
+    else:
+        step = natural + wrapped(place - c[PHASE] - natural)
+        c[PHASE] += min(max(step, SLOWEST * natural), QUICKEST * natural)
+        c[PHASE] -= math.floor(c[PHASE])
+    off = wrapped(c[PHASE] - place)
+    h = max(c[SPREAD], 1e-4)
+    late, early = _place(c, now_s, c[RR] + h), _place(c, now_s, c[RR] - h)
+    by_interval = 0.5 * c[SPREAD] / h * wrapped(early - late)
+    by_peak = R_SD_S / c[RR]
+    c[SD] = math.sqrt(by_interval * by_interval + by_peak * by_peak + off * off)
+    good = c[STATE] == REGULAR and c[GOOD] >= c[NEEDED] and c[SD] <= MOST_SD
+    # Once valid, a beat that corrects the phase a little more than usual does not end it.
+    c[VALID] = (
+        1.0 if good and (abs(off) <= CLOSE or (c[VALID] > 0.0 and abs(off) <= 3 * CLOSE)) else 0.0
+    )
+
+
+@compiled
+def to_cycle_all(phases: Float, rr_s: Float, cycle_rr_s: float, out: Float) -> None:
+    """:func:`to_cycle` of each of ``(n,)`` phases and intervals."""
+    for i in range(len(phases)):
+        out[i] = to_cycle(phases[i], rr_s[i], cycle_rr_s)

@@ -1,0 +1,30 @@
+/* Reads rows of (what, time, flag): what 0 is a beat, what 1 a question. Writes what came back. */
+#include <stdio.h>
+
+#define BEATFIELD_CLOCK_IMPLEMENTATION
+#include "beatfield_clock.h"
+
+int main(void)
+{
+    double head[2], row[3];
+    bf_clock clock;
+    if (fread(head, sizeof head, 1, stdin) != 1)
+        return 1;
+    clock = bf_new_clock(head[0], head[1]);
+    while (fread(row, sizeof row, 1, stdin) == 1) {
+        double out[6] = {0, 0, 0, 0, 0, 0};
+        if (row[0] == 0.0) {
+            out[0] = (double)bf_beat(&clock, row[1], row[2] > 0.0);
+        } else {
+            bf_tick tick;
+            out[0] = bf_now(&clock, row[1], row[2] > 0.0, &tick);
+            out[1] = tick.phase;
+            out[2] = tick.sd;
+            out[3] = (double)tick.rhythm;
+            out[4] = tick.valid;
+            out[5] = tick.fade;
+        }
+        fwrite(out, sizeof out, 1, stdout);
+    }
+    return 0;
+}

@@ -1,0 +1,66 @@
+"""``beatfield rpeaks``: a table for any record, and nothing for one that cannot be read."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from data_synth.ecg import EcgSettings, simulate_ecg, write_wfdb
+from pipeline.cli import main
+
+
+@pytest.fixture(scope="module")
+def ecg():
+    settings = EcgSettings(ectopic_probability=0.1)
+    return simulate_ecg(np.random.default_rng(4), 40.0, 0.8, 250.0, settings)
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("ending", ["", ".hea", ".dat"])
+def test_a_wfdb_record_gives_its_beats(ecg, tmp_path, ending, capsys):
+    write_wfdb(tmp_path, "rec", ecg)
+    assert main(["rpeaks", str(tmp_path / f"rec{ending}"), "--out", str(tmp_path / "p.csv")]) == 0
+    rows = rows_of(tmp_path / "p.csv")
+    times_s = np.array([float(row["time_s"]) for row in rows])
+    inner_s = ecg.r_times_s[(ecg.r_times_s > 0.1) & (ecg.r_times_s < 39.8)]
+    assert np.abs(inner_s[:, None] - times_s).min(axis=1).max() < 0.02
+    assert (np.diff(times_s) > 0).all()
+    ectopic = np.array([row["kind"] != "normal" for row in rows])
+    nearest = np.abs(ecg.r_times_s[:, None] - times_s).argmin(axis=1)
+    learnt = ecg.r_times_s > 5.0
+    assert ectopic[nearest[ecg.ectopic & learnt]].all(), "every early beat is called one"
+    assert {row["lead"] for row in rows} <= set(ecg.leads)
+    assert {row["valid"] for row in rows} == {"0", "1"}
+    assert "beats" in capsys.readouterr().out
+
+
+def test_csv_times_are_those_of_the_recording(ecg, tmp_path):
+    times_s = 100.0 + np.arange(len(ecg.signal_mv)) / 250.0
+    lines = ["time_s,I,II,V1"]
+    lines += [
+        f"{t:.3f}," + ",".join(f"{v:.4f}" for v in row)
+        for t, row in zip(times_s, ecg.signal_mv, strict=True)
+    ]
+    (tmp_path / "ecg.csv").write_text("\n".join(lines) + "\n")
+    assert main(["rpeaks", str(tmp_path / "ecg.csv"), "--out", str(tmp_path / "p.csv")]) == 0
+    found_s = np.array([float(row["time_s"]) for row in rows_of(tmp_path / "p.csv")])
+    inner_s = 100.0 + ecg.r_times_s[(ecg.r_times_s > 0.1) & (ecg.r_times_s < 39.8)]
+    assert np.abs(inner_s[:, None] - found_s).min(axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("record", "out", "words"),
+    [("none", "p.csv", "no such ECG"), ("rec", "nowhere/p.csv", "cannot be written")],
+)
+def test_trouble_ends_with_exit_code_2_and_no_file(ecg, tmp_path, capsys, record, out, words):
+    write_wfdb(tmp_path, "rec", ecg)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["rpeaks", str(tmp_path / record), "--out", str(tmp_path / out)]) == 2
+    assert words in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
