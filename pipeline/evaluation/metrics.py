@@ -137,6 +137,26 @@ def dice(
     return overlap
 
 
+def pooled_dice(
+    found: npt.NDArray[np.integer], truth: npt.NDArray[np.integer]
+) -> npt.NDArray[np.float64]:
+    """Overlap of all structures together in every slice of ``(..., y, x)`` labels, ``(...)``.
+
+    2 (pixels that bear the same label) / (pixels labelled in one + in the other); NaN where
+    neither shows anything. A pixel of the wrong structure counts as wrong.
+
+    Raises
+    ------
+    InputError
+        When the arrays differ in shape.
+    """
+    if found.shape != truth.shape:
+        raise InputError(f"labels to compare must share a shape, got {found.shape}, {truth.shape}")
+    same = ((found == truth) & (found > 0)).sum(axis=(-2, -1))
+    total = (found > 0).sum(axis=(-2, -1)) + (truth > 0).sum(axis=(-2, -1))
+    return np.asarray(np.where(total > 0, 2 * same / np.maximum(total, 1), np.nan))
+
+
 def target_registration_error_mm(
     found_mr_from_tracker: Float, true_mr_from_tracker: Float, targets_mr_mm: Float
 ) -> Float:

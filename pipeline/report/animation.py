@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry import MovingSurface
+from pipeline.geometry import Float, Float32, MovingSurface
 
 COLOURS = {
     "epicardium": "#C0504D",
@@ -25,9 +25,15 @@ COLOURS = {
     "right_atrium": "#CC79A7",
     "aorta": "#D55E00",
 }
-FRAMES = 12
-SIZE_PIXELS = (440, 440)
-TIME_LIMIT_S = 90
+FRAMES = 20
+SIZE_PIXELS = (520, 520)
+TIME_LIMIT_S = 300
+
+# Seen from the patient's front left (LPS: left is +x, anterior is -y), head up.
+TOWARDS_VIEWER = np.array([0.5, -1.0, 0.25])
+HEAD = np.array([0.0, 0.0, 1.0])
+ROOM = 1.06
+"""The picture is this much larger than what moves in it."""
 
 
 def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> bytes | None:
@@ -50,11 +56,44 @@ def _hand_over(path: Path, surfaces: Mapping[str, MovingSurface]) -> None:
     arrays: dict[str, Any] = {}
     for name, moving in surfaces.items():
         if name in COLOURS:
-            count = len(moving.phases)
-            chosen = np.unique(np.linspace(0, count, FRAMES, endpoint=False).astype(int))
-            arrays[f"{name}.vertices"] = moving.vertices_mm[chosen]
+            arrays[f"{name}.vertices"] = even_in_time(moving, FRAMES)
             arrays[f"{name}.triangles"] = moving.triangles
     np.savez(path, **arrays)
+
+
+def even_in_time(moving: MovingSurface, count: int) -> Float32:
+    """Vertices ``(count, n, 3)`` at even steps of one beat, straight between stored phases.
+
+    Vertices correspond, so a few phases, unevenly spaced, still make an even motion; the last
+    phase leads back to the first.
+    """
+    known = np.concatenate([moving.phases, moving.phases[:1] + 1])
+    wanted = moving.phases[0] + np.arange(count) / count
+    before = np.searchsorted(known, wanted, side="right") - 1
+    share = (wanted - known[before]) / (known[before + 1] - known[before])
+    after = (before + 1) % len(moving.phases)
+    path = moving.vertices_mm
+    frames = [(1 - w) * path[i] + w * path[j] for i, j, w in zip(before, after, share, strict=True)]
+    return np.stack(frames).astype(np.float32)
+
+
+def framing(points_mm: Float) -> tuple[Float, float]:
+    """Where a parallel camera looks, and half the height it must see, for all points to show.
+
+    Parameters
+    ----------
+    points_mm
+        ``(n, 3)``; everything that is to be in the picture, at all times.
+    """
+    towards = TOWARDS_VIEWER / np.linalg.norm(TOWARDS_VIEWER)
+    right = np.cross(HEAD, towards)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(towards, right), towards])
+    seen = points_mm @ axes.T
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    wide, tall, _ = (high - low) / 2
+    half_mm = ROOM * max(tall, wide * SIZE_PIXELS[1] / SIZE_PIXELS[0])
+    return np.asarray((low + high) / 2 @ axes), float(half_mm)
 
 
 def _webp(frames: Any, rr_s: float) -> bytes:
@@ -87,9 +126,14 @@ def _draw(work: Path) -> None:
         )
         meshes[name] = mesh
         plotter.add_mesh(mesh, color=COLOURS[name])
-    # Seen from the patient's front left (LPS: left is +x, anterior is -y), head up.
-    plotter.view_vector((0.5, -1.0, 0.25), viewup=(0, 0, 1))
-    plotter.camera.zoom(1.4)
+    everything = [arrays[f"{name}.vertices"].reshape(-1, 3) for name in names]
+    centre_mm, half_mm = framing(np.concatenate(everything))
+    plotter.view_vector(TOWARDS_VIEWER, viewup=HEAD)
+    plotter.enable_parallel_projection()
+    plotter.camera.focal_point = centre_mm
+    plotter.camera.position = centre_mm + 500 * TOWARDS_VIEWER
+    plotter.camera.parallel_scale = half_mm
+    plotter.camera.clipping_range = (1, 2000)
     frames = []
     for number in range(len(arrays[f"{names[0]}.vertices"])):
         for name, mesh in meshes.items():

@@ -13,11 +13,13 @@ from pipeline.evaluation.metrics import (
     dice,
     ejection_fraction,
     phase_error,
+    pooled_dice,
     surface_distance,
     target_registration_error_mm,
     volumes_ml,
 )
-from pipeline.geometry import MovingSurface, Surface
+from pipeline.evaluation.motion import motion_error
+from pipeline.geometry import Label, MovingSurface, Surface
 from pipeline.imaging.labels import LABELS
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
@@ -31,6 +33,9 @@ LABEL_OF_SURFACE = {
     "right_atrium": "right_atrium",
     "aorta": "aorta",
 }
+
+REFERENCE = 0
+"""Number of the phase from which displacements count: the first one, next to the R peak."""
 
 # Points per surface and phase; the mean distance of 4000 stratified samples repeats to 0.02 mm.
 SAMPLES = 4000
@@ -46,9 +51,13 @@ def run(job: Job) -> dict[str, Any]:
     if not np.allclose(phases, known["phases"], atol=0.02):
         raise InputError(f"{truth}/truth.json: its phases are not those of the cine")
     surfaces = read_surfaces(job.products / "surface", phases)
+    found, known_labels = _labels(job, truth)
     metrics: dict[str, Any] = {
-        "structures": _structures(job, truth, surfaces),
-        "lv_ejection_fraction": _ejection_fractions(surfaces, known),
+        "structures": _structures(job, truth, surfaces, _overlap(found, known_labels)),
+        "lv_ejection_fraction": _ejection_fractions(surfaces, known, "lv_endocardium"),
+        "rv_ejection_fraction": _ejection_fractions(surfaces, known, "rv_endocardium"),
+        "lv_mass_g": _masses(job, known),
+        "slice_dice": _rounded(pooled_dice(found, known_labels)),
     }
     if job.product("register"):
         metrics |= _registration(job, truth, known)
@@ -64,9 +73,8 @@ def _read_truth(truth: Path) -> dict[str, Any]:
 
 
 def _structures(
-    job: Job, truth: Path, surfaces: dict[str, MovingSurface]
+    job: Job, truth: Path, surfaces: dict[str, MovingSurface], overlap: dict[str, list[float]]
 ) -> dict[str, dict[str, Any]]:
-    overlap = _overlap(job, truth)
     names = [name for name in surfaces if (truth / "surfaces" / f"{name}_000.vtp").exists()]
     metrics: dict[str, dict[str, Any]] = {}
     for done, name in enumerate(names):
@@ -77,6 +85,7 @@ def _structures(
         ]
         metrics[name] = _structure(moving, known)
         metrics[name]["dice"] = overlap.get(LABEL_OF_SURFACE.get(name, ""), [])
+        metrics[name] |= _motion(moving, known)
         job.progress(done + 1, len(names))
     return metrics
 
@@ -96,19 +105,64 @@ def _structure(moving: MovingSurface, known: list[Surface]) -> dict[str, Any]:
     }
 
 
-def _overlap(job: Job, truth: Path) -> dict[str, list[float]]:
-    """Dice of each label on the cine's own pixels, one value a phase."""
+def _motion(moving: MovingSurface, known: list[Surface]) -> dict[str, Any]:
+    """Errors of motion; nothing where truth's meshes do not correspond from phase to phase."""
+    triangles = known[0].triangles
+    if not all(np.array_equal(one.triangles, triangles) for one in known):
+        return {}
+    path = np.stack([one.vertices_mm for one in known])
+    error = motion_error(moving, MovingSurface(path, triangles, moving.phases), REFERENCE)
+    across, along = error.mean_mm()
+    return {
+        "motion_error_mm": {
+            "reference_phase": float(moving.phases[REFERENCE]),
+            "normal": _rounded(error.normal_mm, 3),
+            "tangential": _rounded(error.tangential_mm, 3),
+            "normal_mean": round(across, 3),
+            "tangential_mean": round(along, 3),
+        }
+    }
+
+
+def _labels(job: Job, truth: Path) -> tuple[Label, Label]:
+    """Labels found and true on the cine's own pixels, ``(phase, z, y, x)``."""
     found, _ = read_labels(job.products / "segment", "labels")
     known, _ = read_labels(truth, "labels")
+    if found.shape != known.shape:
+        raise InputError(
+            f"{truth}: its labels are {known.shape} (phase, slice, row, column), those found are "
+            f"{found.shape}; truth and cine must be of one study"
+        )
+    return found, known
+
+
+def _overlap(found: Label, known: Label) -> dict[str, list[float]]:
+    """Dice of each label on the cine's own pixels, one value a phase."""
     each = [dice(one, other, LABELS) for one, other in zip(found, known, strict=True)]
     return {name: [round(one[name], 4) for one in each if name in one] for name in LABELS}
 
 
+def _rounded(values: Any, digits: int = 4) -> Any:
+    """Nested lists of an array's values, None in place of NaN, which JSON does not know."""
+    if np.ndim(values):
+        return [_rounded(one, digits) for one in values]
+    return round(float(values), digits) if np.isfinite(values) else None
+
+
+def _masses(job: Job, known: dict[str, Any]) -> dict[str, float]:
+    """Mass of the left muscle: the mean over the phases, for it does not change with them."""
+    measured = read_table(job.products / "surface" / "measures.json")["lv_mass_g"]
+    return {
+        "found": round(float(np.mean(measured)), 2),
+        "truth": round(float(known["lv_mass_g"]), 2),
+    }
+
+
 def _ejection_fractions(
-    surfaces: dict[str, MovingSurface], known: dict[str, Any]
+    surfaces: dict[str, MovingSurface], known: dict[str, Any], chamber: str
 ) -> dict[str, float]:
-    found = ejection_fraction(volumes_ml(surfaces["lv_endocardium"]))
-    truth = ejection_fraction(np.array(known["volumes_ml"]["lv_endocardium"]))
+    found = ejection_fraction(volumes_ml(surfaces[chamber]))
+    truth = ejection_fraction(np.array(known["volumes_ml"][chamber]))
     return {"found": round(found, 4), "truth": round(truth, 4)}
 
 

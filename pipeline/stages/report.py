@@ -7,14 +7,18 @@ from typing import Any
 import numpy as np
 
 from pipeline.field.reader import ForceField
-from pipeline.geometry import MovingSurface
+from pipeline.geometry import Float, MovingSurface
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.nifti import read_image
 from pipeline.imaging.ultrasound import read_sweep
 from pipeline.job import Job
-from pipeline.products import read_cine, read_frames, read_labels, read_surfaces, read_table
+from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.publish import sealed
-from pipeline.report import pictures
-from pipeline.report.animation import beating_surfaces
-from pipeline.report.page import Picture, Section, Table, picture, render
+from pipeline.report import heart, pictures
+from pipeline.report.moments import Moments
+from pipeline.report.page import Section, Table, picture, render
+from pipeline.report.slices import lowest_place
+from pipeline.report.style import as_png, as_svg
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -22,29 +26,52 @@ ULTRASOUND_FRAMES_SHOWN = 4
 def run(job: Job) -> dict[str, Any]:
     """Write ``index.html``, which needs no other file."""
     cine = read_cine(job.products / "ingest")
-    surfaces = read_surfaces(job.products / "surface", cine.phases)
-    volumes = figures_of(job, "surface")["volumes_ml"]
-    left_ventricle = volumes["lv_endocardium"]
-    moments = {
-        "end-diastole": int(np.argmax(left_ventricle)),
-        "end-systole": int(np.argmin(left_ventricle)),
-    }
+    phases, rr_s = cine.phases, cine.rr_s
+    measures = read_table(job.products / "surface" / "measures.json")
+    shown = _moments(job, cine, measures["volumes_ml"]["lv_endocardium"])
+    # Pictures show two phases; a long cine of many slices need not stay in memory.
+    del cine
+    surfaces = read_surfaces(job.products / "surface", phases)
+    confidence, low = _confidence(job)
     sections = [
-        _segmentation(job, moments),
-        _surfaces(surfaces, cine.rr_s, cine.phases, volumes),
+        heart.segmentation(shown, confidence, low),
+        heart.movement(surfaces, rr_s, phases, measures),
         *_registration(job, surfaces),
-        _field(job, moments),
+        _field(job, shown),
         *_evaluation(job),
     ]
     page = render(
         job.study.patient_id,
-        _summary(job, moments, left_ventricle),
+        _summary(job, measures, confidence),
         sections,
         _example(job),
         _notes(job),
     )
     (job.folder / "index.html").write_text(page)
     return {"pictures": sum(len(section.pictures) for section in sections)}
+
+
+def _moments(job: Job, cine: Cine, left_ventricle: list[float]) -> Moments:
+    """The phases in which the left ventricle is largest and smallest."""
+    numbers = (int(np.argmax(left_ventricle)), int(np.argmin(left_ventricle)))
+    folder = job.products / "segment"
+    labels = [read_image(folder / f"labels_{number:03d}.nii.gz")[0] for number in numbers]
+    return Moments(
+        names=("End-diastole", "End-systole"),
+        numbers=numbers,
+        phases=cine.phases[list(numbers)],
+        intensity=cine.intensity[list(numbers)],
+        labels=np.stack(labels).astype(np.uint8),
+        mr_from_index=cine.mr_from_index,
+        interpolated=cine.interpolated,
+    )
+
+
+def _confidence(job: Job) -> tuple[Float, float]:
+    """Confidence ``(phase, slice)``, NaN where it was not judged, and what counts as low."""
+    said = read_table(job.products / "segment" / "confidence.json")
+    low = float(said.get("low_below", heart.LOW_CONFIDENCE))
+    return np.array(said["confidence"], dtype=float), low
 
 
 def figures_of(job: Job, stage: str) -> dict[str, Any]:
@@ -55,10 +82,8 @@ def figures_of(job: Job, stage: str) -> dict[str, Any]:
     return figures
 
 
-def _summary(
-    job: Job, moments: dict[str, int], left_ventricle: list[float]
-) -> list[tuple[str, str]]:
-    ingest, surface = figures_of(job, "ingest"), figures_of(job, "surface")
+def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tuple[str, str]]:
+    ingest = figures_of(job, "ingest")
     accuracy = figures_of(job, "bake")["accuracy"]
     rows = [
         (
@@ -66,9 +91,8 @@ def _summary(
             f"{ingest['slices']} slices, {ingest['phases']} phases, {ingest['timing_source']}",
         ),
         ("heart rate", f"{60 / ingest['rr_s']:.0f} beats/min"),
-        ("LV end-diastolic volume", f"{left_ventricle[moments['end-diastole']]:.0f} ml"),
-        ("LV end-systolic volume", f"{left_ventricle[moments['end-systole']]:.0f} ml"),
-        ("LV ejection fraction", f"{100 * surface['lv_ejection_fraction']:.0f} %"),
+        *heart.function_rows(measures),
+        ("lowest confidence of the labels", lowest_place(confidence)),
     ]
     if job.product("register"):
         register = figures_of(job, "register")
@@ -80,39 +104,15 @@ def _summary(
 
 def _notes(job: Job) -> list[str]:
     notes = []
+    missing = figures_of(job, "ingest")["interpolated_slices"]
+    if missing:
+        named = ", ".join(str(number) for number in missing)
+        notes.append(f"Not recorded, so drawn between their neighbours: slices {named}.")
     if not job.product("register"):
         notes.append("No tracked ultrasound: the field is in the frame of the MR.")
     if not job.product("evaluate"):
         notes.append("No known truth in this study: accuracy against truth was not measured.")
     return notes
-
-
-def _segmentation(job: Job, moments: dict[str, int]) -> Section:
-    cine = read_cine(job.products / "ingest")
-    labels, _ = read_labels(job.products / "segment", "labels")
-    figure = pictures.contours_on_slices(cine, labels, moments)
-    lowest = figures_of(job, "segment")["lowest_confidence"]
-    return Section(
-        "Segmentation",
-        f"Chambers and heart muscle on the cine's own slices. Lowest confidence: {lowest:.2f}.",
-        [picture("Contours from apex to base", pictures.as_png(figure), "png")],
-    )
-
-
-def _surfaces(
-    surfaces: dict[str, MovingSurface], rr_s: float, phases: Any, volumes: dict[str, list[float]]
-) -> Section:
-    shown: list[Picture] = []
-    animation = beating_surfaces(surfaces, rr_s)
-    if animation is not None:
-        shown.append(picture("One heartbeat, seen from the front left", animation, "webp"))
-    curves = pictures.as_svg(pictures.volume_curves(phases, volumes))
-    shown.append(picture("Volumes through the cycle", curves, "svg"))
-    return Section(
-        "Surfaces",
-        "Closed surfaces whose vertices are the same material points in every phase.",
-        shown,
-    )
 
 
 def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]:
@@ -139,17 +139,15 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             "Registration",
             "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
             "phase of the heartbeat. Where the lines follow the walls, the registration holds.",
-            [picture("Ultrasound with the registered surfaces", pictures.as_png(figure), "png")],
+            [picture("Ultrasound with the registered surfaces", as_png(figure), "png")],
         )
     ]
 
 
-def _field(job: Job, moments: dict[str, int]) -> Section:
-    cine = read_cine(job.products / "ingest")
-    labels, _ = read_labels(job.products / "segment", "labels")
+def _field(job: Job, shown: Moments) -> Section:
     field = ForceField.open(job.products / "bake" / "field.zarr")
     name = next(iter(field.fixtures))
-    figure = pictures.potential_on_slice(cine, labels, field, name, moments)
+    figure = pictures.potential_on_slice(shown, field, name)
     profiles = pictures.fixture_profiles(job.settings.fixtures)
     rows = [
         (
@@ -172,8 +170,8 @@ def _field(job: Job, moments: dict[str, int]) -> Section:
         "The potential over an MR slice, lines of equal distance every 5 mm (the surface is bold) "
         "and arrows of force.",
         [
-            picture("Potential, distance and force", pictures.as_png(figure), "png"),
-            picture("Force of each fixture", pictures.as_svg(profiles), "svg"),
+            picture("Potential, distance and force", as_png(figure), "png"),
+            picture("Force of each fixture", as_svg(profiles), "svg"),
         ],
         [Table(head, rows), _flat("accuracy certificate", figures_of(job, "bake")["accuracy"])],
     )
@@ -198,17 +196,9 @@ def _evaluation(job: Job) -> list[Section]:
     if folder is None:
         return []
     metrics = read_table(folder / "metrics.json")
-    rows = [
-        (
-            name,
-            f"{np.mean(one['mean_surface_distance_mm']):.2f}",
-            f"{max(one['mean_surface_distance_mm']):.2f}",
-            f"{max(one['hausdorff_95_mm']):.2f}",
-            f"{np.mean(one['dice']):.3f}" if one.get("dice") else "-",
-        )
-        for name, one in metrics["structures"].items()
-    ]
-    head = ("surface", "mean distance mm", "worst phase mm", "95 % Hausdorff mm", "mean Dice")
+    rows = [_against_truth(name, one) for name, one in metrics["structures"].items()]
+    head = ["surface", "mean distance mm", "worst phase mm", "95 % Hausdorff mm", "mean Dice"]
+    head += ["worst Dice", "motion, normal mm", "tangential mm"]
     others = {key: value for key, value in metrics.items() if key != "structures"}
     return [
         Section(
@@ -216,6 +206,21 @@ def _evaluation(job: Job) -> list[Section]:
             "This study is synthetic, so its truth is known; only this stage reads it.",
             tables=[Table(head, rows), _flat("registration and volumes", others)],
         )
+    ]
+
+
+def _against_truth(name: str, one: dict[str, Any]) -> list[str]:
+    overlap = one.get("dice") or []
+    motion = one.get("motion_error_mm")
+    return [
+        name,
+        f"{np.mean(one['mean_surface_distance_mm']):.2f}",
+        f"{max(one['mean_surface_distance_mm']):.2f}",
+        f"{max(one['hausdorff_95_mm']):.2f}",
+        f"{np.mean(overlap):.3f}" if overlap else "-",
+        f"{min(overlap):.3f}" if overlap else "-",
+        f"{motion['normal_mean']:.2f}" if motion else "-",
+        f"{motion['tangential_mean']:.2f}" if motion else "-",
     ]
 
 
