@@ -54,12 +54,14 @@ types: setup ## static types
 bench: setup ## speed beside peers, as ratios in one run
 	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
 
-train: setup ## make the segmentation weights anew from the phantom (an hour and a half; needs PyTorch)
+train: setup ## make the segmentation weights anew from the phantom (two and a half hours; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(BIN)/python -m data_synth.training --out training --without rims
-	$(BIN)/python -m data_synth.training --out training/fine --pool training/pool \
-		--start training/heart.pt --learning-rate 8e-4 --steps 4000
-	cp training/fine/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(BIN)/python -m data_synth.training --out training --without rims --without bare
+	$(BIN)/python -m data_synth.training --out training/second --pool training/pool \
+		--start training/heart.pt --learning-rate 1e-3 --steps 8000
+	$(BIN)/python -m data_synth.training --out training/third --pool training/pool --seed 1 --hearts 80 \
+		--start training/second/heart.pt --learning-rate 1e-3 --steps 5000
+	cp training/third/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
 	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)

@@ -1,5 +1,7 @@
 """Training of the segmentation network: what it learns from, and that it can be repeated."""
 
+from dataclasses import fields
+
 import cv2
 import numpy as np
 import pytest
@@ -31,6 +33,7 @@ from data_synth.training.render import (  # noqa: E402
     Parts,
     _draw_positions,
     draw_sample,
+    laid_bare,
     thin_walled,
 )
 
@@ -114,10 +117,28 @@ def test_thin_wall_loses_its_outer_layers_to_what_lies_there(layers):
     assert np.isin(bare[ring], (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM)).all()
 
 
+def test_what_lies_around_comes_up_to_the_heart_in_place_of_its_covers():
+    rows, columns = np.mgrid[:64, :64]
+    away = np.hypot(rows - 32, columns - 32)
+    plane = np.where(columns < 32, Tissue.LIVER, Tissue.LUNG)
+    plane = np.where(away < 22, Tissue.FAT, plane)
+    plane = np.where(away < 18, Tissue.LV_MYOCARDIUM, plane)
+    plane = np.where(away < 12, Tissue.LV_CAVITY, plane).astype(np.uint8)
+    rng = np.random.default_rng(4)
+    found = np.stack([laid_bare(rng, plane[None])[0] for _ in range(60)])
+    changed = found != plane
+    assert (plane[changed.any(axis=0)] == Tissue.FAT).all()
+    assert set(np.unique(found[changed])) == {Tissue.LIVER, Tissue.LUNG, Tissue.PERICARDIUM}
+    # On either side it is what lies there that comes near, at times with nothing between.
+    beside = (away >= 18) & (away < 19.5)
+    for side, tissue in ((columns < 26, Tissue.LIVER), (columns > 38, Tissue.LUNG)):
+        assert (found[:, beside & side] == tissue).any()
+        assert (found[:, beside & side] == Tissue.FAT).any()
+    assert (found[:, (away < 22) & (columns < 26)] != Tissue.LUNG).all()
+
+
 def test_without_random_parts_an_image_is_its_plane_in_one_scanners_grey_values(blocks):
-    plain = Parts(
-        shape=False, contrast=False, detail=False, faults=False, neighbours=False, rims=False
-    )
+    plain = Parts(**{part.name: False for part in fields(Parts)})
     rng = np.random.default_rng(5)
     inside, muscle = [], []
     for k in range(12):

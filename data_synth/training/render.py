@@ -62,10 +62,22 @@ class Parts:
     """Thin walls, dark rims around the heart, and planes that barely cut a ventricle: what is
     easily mistaken, shown more often than it occurs."""
 
+    bare: bool = True
+    """Hearts that lung and organs touch, without fat between: else a wall's outside could be
+    guessed from how far off they are."""
+
 
 ALL_PARTS = Parts()
 
 _WITHIN_MUSCLE = (Tissue.LV_CAVITY, Tissue.PAPILLARY_MUSCLE)
+
+_COVERS = np.isin(list(Tissue), (Tissue.FAT, Tissue.PERICARDIUM))
+
+_AROUND = np.isin(
+    list(Tissue),
+    (Tissue.LUNG, Tissue.LIVER, Tissue.STOMACH, Tissue.SPLEEN, Tissue.GAS, Tissue.MUSCLE),
+)
+"""What may lie against a heart, for every tissue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +99,11 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     planes = block[middle - REACH : middle + REACH + 1]
     if parts.rims and rng.random() < 0.4:
         planes = thin_walled(planes, int(rng.integers(1, 4)))
+    bare = parts.bare and rng.random() < 0.55
+    if bare:
+        planes = laid_bare(rng, planes)
     contrast = draw_contrast(rng) if parts.contrast else USUAL_CONTRAST
-    slices = _thick_slices(rng, planes, contrast, parts)
+    slices = _thick_slices(rng, planes, contrast, parts, fat=not bare or rng.random() < 0.3)
     rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
     image = np.empty((3, CROP, CROP), np.float32)
     strays = parts.neighbours and rng.random() < 0.7
@@ -174,6 +189,38 @@ def thin_walled(planes: Label, layers: int) -> Label:
     return thinner
 
 
+def laid_bare(rng: np.random.Generator, planes: Label) -> Label:
+    """The same heart with what lies around it reaching up to it in places.
+
+    Fat and pericardium near the heart become the nearest of lung, organs and diaphragm; in half of
+    all hearts one pixel of pericardium stays.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue.
+    """
+    reach_px, skin_px = rng.uniform(3.0, 14.0), int(rng.integers(0, 2))
+    chosen = smooth_noise(rng, planes.shape[-1], int(rng.integers(2, 6))) > rng.uniform(-2.5, 0.3)
+    bare = planes.copy()
+    for plane in bare:
+        around = _AROUND[plane]
+        if not around.any():
+            continue
+        away = cv2.distanceTransform((~IN_HEART[plane]).astype(np.uint8), cv2.DIST_L2, 3)
+        _, nearest = cv2.distanceTransformWithLabels(
+            (~around).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        tissue = np.zeros(nearest.max() + 1, np.uint8)
+        tissue[nearest[around]] = plane[around]
+        near = _COVERS[plane] & (away < reach_px) & chosen
+        if skin_px:
+            plane[near & (away <= skin_px)] = Tissue.PERICARDIUM
+        far = near & (away > skin_px)
+        plane[far] = tissue[nearest[far]]
+    return bare
+
+
 def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Places:
     """Where in the plane each pixel of the image lies: row and column, ``(CROP, CROP)``."""
     heart = np.argwhere(LABEL_OF[plane[::4, ::4]]) * 4.0
@@ -220,9 +267,9 @@ def _swollen(rng: np.random.Generator, plane: Label, rows: Float, columns: Float
 
 
 def _thick_slices(
-    rng: np.random.Generator, planes: Label, contrast: Contrast, parts: Parts
+    rng: np.random.Generator, planes: Label, contrast: Contrast, parts: Parts, fat: bool
 ) -> Float32:
-    """Images of the three slices, each the average over its thickness."""
+    """Images of the three slices, each the average over its thickness; ``fat``: may be added."""
     side = planes.shape[-1]
     half = NEIGHBOUR * rng.uniform(0.5, 1.05) / 2
     offsets = np.arange(-2, 3)
@@ -231,7 +278,7 @@ def _thick_slices(
     weights = (weights / weights.sum()).astype(np.float32)
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
-    decor = _Decor(rng, side, parts.rims) if parts.detail else None
+    decor = _Decor(rng, side, parts.rims, fat) if parts.detail else None
     mean = contrast.mean.copy()
     if rng.random() < 0.5:
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
@@ -265,13 +312,13 @@ class _Decor:
     smooth one that a reader draws.
     """
 
-    def __init__(self, rng: np.random.Generator, side: int, rims: bool) -> None:
+    def __init__(self, rng: np.random.Generator, side: int, rims: bool, fat: bool) -> None:
         self.fine = smooth_noise(rng, side, side // int(rng.integers(3, 9)))
         self.coarse = [smooth_noise(rng, side, int(rng.integers(4, 20))) for _ in range(3)]
         self.organ = rng.uniform(0.0, 1.4, 3)
         self.organ_level = rng.uniform(0.5, 2.5, 3)
         self.organs = int(rng.integers(0, 4))
-        self.fat_px = rng.uniform(-6.0, 8.0)
+        self.fat_px = rng.uniform(-6.0, 8.0) if fat else 0.0
         # Mostly fat; an effusion, an organ or lung may lie against the heart as well.
         self.fat = rng.uniform(0.3, 1.6) if rng.random() < 0.75 else rng.uniform(0.0, 1.2)
         self.tubes = rng.uniform(0.0, 1.0, (int(rng.integers(0, 5)), 5))

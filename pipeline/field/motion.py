@@ -7,7 +7,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from pipeline.geometry import Float, Surface
+from pipeline.geometry import Float, Integer, Surface
 
 
 class BeatingSurface(Protocol):
@@ -29,11 +29,14 @@ class Motion:
     fifth degree where there are phases enough, as it follows a heart more closely than the cubic.
     """
 
-    path: Any
-    """Places ``(n, 3)`` at a phase, LPS mm."""
+    weights: Any
+    """What each stored phase's places count for at a phase, ``(phase,)``."""
 
-    template: Surface
-    """The surface at the first phase."""
+    places_mm: Float
+    """``(phase, n, 3)`` at the stored phases, LPS mm."""
+
+    triangles: Integer
+    """``(m, 3)`` vertex numbers."""
 
     @classmethod
     def of(cls, moving: BeatingSurface) -> Self | None:
@@ -49,14 +52,17 @@ class Motion:
         )
         if not same or count < 3:
             return None
-        places = np.stack([one.vertices_mm for one in [*each, first]])
         phases = np.append(moving.phases, moving.phases[0] + 1)
         order = 5 if count >= 8 else 3
-        return cls(make_interp_spline(phases, places, k=order, bc_type="periodic"), first)
+        # SciPy solves one right-hand side after another: a spline for each phase is far fewer than
+        # one for each coordinate.
+        one_by_one = np.eye(count)[[*range(count), 0]]
+        weights = make_interp_spline(phases, one_by_one, k=order, bc_type="periodic")
+        return cls(weights, np.stack([one.vertices_mm for one in each]), first.triangles)
 
     def at(self, phase: float) -> Surface:
         """The surface at any phase."""
-        return Surface(np.asarray(self.path(phase)), self.template.triangles)
+        return Surface(np.tensordot(self.weights(phase), self.places_mm, 1), self.triangles)
 
 
 def halfway(phases: Float) -> Float:

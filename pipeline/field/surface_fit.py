@@ -162,7 +162,8 @@ def _slope(change: Float32, moments: Sequence[_Moment], off: Sequence[Float32]) 
 
 
 def _squares(parts: Sequence[Float32]) -> float:
-    return float(sum(np.dot(one.ravel(), one.ravel()).astype(float) for one in parts))
+    # A product by BLAS would be summed in an order that depends on its threads.
+    return float(sum(np.square(one).sum(dtype=float) for one in parts))
 
 
 def _values(coefficients: Float32, moment: _Moment) -> Float32:

@@ -56,6 +56,8 @@ MARGIN_VOXELS = 8
 BLEND_WIDENINGS = (1.0, 1.5, 2.0)
 
 Progress = Callable[[int, int], None]
+# Tries at a mesh that passes through itself.
+UNCROSSINGS = 4
 # The interpreter lock leaves nothing for more.
 THREADS = 2
 
@@ -367,11 +369,16 @@ def _finished(
         vertices = untangled(unfolder.mended(path_mm[k], bad_triangles), triangles, level)
         vertices = restore_volume(vertices, triangles, volume_mm3)
         vertices = untangled(vertices, triangles, level)
-        apart = unfolder.mended(vertices, crossing_triangles)
-        if apart is vertices:
-            return vertices, False, 0
-        apart = restore_volume(uncrossed(apart, triangles, level), triangles, volume_mm3)
-        return apart, True, int(np.count_nonzero(crossing_triangles(apart, triangles)))
+        crossing = 0
+        for tries in range(UNCROSSINGS):
+            apart = unfolder.mended(vertices, crossing_triangles)
+            if apart is vertices:
+                return vertices, tries > 0, 0
+            # Bringing the volume back may press together what was just opened.
+            apart = uncrossed(apart, triangles, level)
+            vertices = restore_volume(apart, triangles, volume_mm3)
+            crossing = int(np.count_nonzero(crossing_triangles(vertices, triangles)))
+        return vertices, True, crossing
 
     places, mended, left = zip(*across(sound, range(len(path_mm))), strict=True)
     moving = MovingSurface(np.stack(places), triangles, phases)
