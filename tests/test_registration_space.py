@@ -24,11 +24,12 @@ from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import MovingSurface
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.space import register
+from pipeline.registration.space import find, register
+from pipeline.registration.uncertainty import motion_between
 
 # A tool that is off by this much misses: the figure that the field's users are promised.
 PROMISED_MM = 1.5
-QUICK = RegisterSettings(grid_mm=2.5, starts=2, max_frames=30)
+QUICK = RegisterSettings(grid_mm=3.0, sample_spacing_mm=6.0, candidates=80, starts=2, max_frames=20)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,34 @@ class TestRegister:
         assert found.confidence > QUICK.min_confidence
         assert found.residual.shape == found.valid.shape == (28,)
         assert told == [(step, told[-1][1]) for step in range(1, told[-1][1] + 1)]
+
+    def test_result_says_how_sure_it_is(self, surfaces, recording):
+        """Surfaces, calibration and breath are exact here, so the frames' own spread is the error.
+
+        Over 6 parameters the squared error in units of the covariance is chi-square with 6 degrees
+        of freedom or less (the floor of 0.5 mm is on top): 22.5 is passed by 1 in 1000.
+        """
+        found = register(
+            recording.sweeps, recording.phases, surfaces, start_off(recording, 5, 10, 10), QUICK
+        )
+        off = motion_between(found.mr_from_tracker, recording.mr_from_tracker, found.centre_mm)
+        assert off @ np.linalg.solve(found.covariance, off) < 22.5
+        np.testing.assert_allclose(found.covariance, found.covariance.T)
+        # The floor alone is sqrt(3) of 0.5 mm at the centre.
+        points = found.centre_mm + np.array([[0, 0, 0], [0, 0, 80]])
+        near, far = found.expected_tre_mm(points)
+        assert np.sqrt(3) * 0.5 < near < far
+        assert found.verdict in ("good", "doubtful")
+        assert (found.reason == "") == (found.verdict == "good")
+
+    def test_pose_is_found_without_any_start(self, surfaces, recording):
+        anywhere = QUICK.model_copy(update={"candidates_anywhere": 3000, "starts": 3})
+        found = find(recording.sweeps, recording.phases, surfaces, None, anywhere)
+        points = surfaces["lv_endocardium"].vertices_mm[0]
+        error_mm = target_error_mm(found.mr_from_tracker, recording.mr_from_tracker, points)
+        assert error_mm.max() < PROMISED_MM
+        assert found.verdict != "failed"
+        assert found.start_score == 0
 
     def test_same_input_gives_the_same_bytes(self, surfaces, recording):
         start = start_off(recording, 7, 5, 5)
@@ -142,6 +171,12 @@ class TestRefusals:
         ]
         with pytest.raises(StageError, match="no pose to trust"):
             register(sweeps, recording.phases, surfaces, recording.mr_from_tracker, QUICK)
+
+    def test_doubtful_result_is_refused_where_only_good_is_accepted(self, surfaces, recording):
+        strict = QUICK.model_copy(update={"accept": "good", "good_tre_mm": 0.1, "starts": 1})
+        start = start_off(recording, 5, 3, 3)
+        with pytest.raises(StageError, match=r"doubtful, and register\.accept is good: expected"):
+            register(recording.sweeps, recording.phases, surfaces, start, strict)
 
     def test_pictures_of_another_view_are_not_trusted(self, surfaces, recording):
         """Each sweep's pictures at the other's poses: real anatomy, wrong place."""

@@ -56,7 +56,7 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     drawn
         ``(phase, slice, row, column)`` most probable labels on the slices.
     """
-    heart = drawn > 0
+    heart = np.stack([_without_strays(labels > 0) for labels in drawn])
     area = heart.sum(axis=(2, 3))
     largest = np.maximum(area.max(axis=1, keepdims=True), 1)
     confidence = _certainty(found, heart, area >= LEAST_CUT * largest)
@@ -73,6 +73,31 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     confidence *= _ramp(_best_in_space(images, step), ALIKE_IN_SPACE)
     overlap = _best_overlap_in_space(heart, step)
     return np.asarray(confidence * np.where(large, _ramp(overlap, OVERLAP), 1))
+
+
+def _without_strays(heart: Mask) -> Mask:
+    """What is taken for heart ``(slice, row, column)``, without what lies aside beyond its ends.
+
+    Bowels and vessels beyond the tip are dropped later; they say nothing of how well the heart is
+    understood. From the largest cut outwards a slice belongs to the heart that overlaps the last
+    one that does; one in between may be spoilt.
+    """
+    largest = int(heart.sum(axis=(1, 2)).argmax())
+    first, last = (_last_reached(heart, largest, step) for step in (-1, 1))
+    kept = heart.copy()
+    kept[:first] = False
+    kept[last + 1 :] = False
+    return kept
+
+
+def _last_reached(heart: Mask, start: int, step: int) -> int:
+    """The last slice on the way from ``start`` that overlaps one before it, at most one between."""
+    last, number = start, start + step
+    while 0 <= number < len(heart) and abs(number - last) <= 2:
+        if _dice(heart[None, [number]], heart[None, [last]]) >= OVERLAP[0]:
+            last = number
+        number += step
+    return last
 
 
 def _certainty(found: PlaneProbability, heart: Mask, large: Mask) -> Float:

@@ -72,8 +72,8 @@ def locate_heart(cine: Cine) -> Found:
         raise StageError(
             f"phases {first} and {second}, slices 0 to {cine.intensity.shape[1] - 1}: no heart "
             f"found: the largest area taken for heart is {largest_mm2:.0f} mm2 over all slices, "
-            "whichever way the images are turned; check that the study is a cardiac cine "
-            "(`inspect`), and leave series of other parts of the body out"
+            "whichever way the images are turned; check that the study is a cardiac cine, "
+            "and leave series of other parts of the body out"
         )
     orientation = find_orientation(_look_about(cine, view))
     if orientation != sought:

@@ -159,7 +159,7 @@ def _require_ring(drawn: Label, view: View) -> None:
             f"phase {bare.argmax()}, slices 0 to {len(view.order) - 1}: no heart found: of what "
             f"looks like the left ventricle's cavity, {100 * bare.max():.0f} % of the border has "
             f"no heart muscle, at most {100 * LARGEST_BARE:.0f} % were expected; check that the "
-            "study is a cardiac cine (`inspect`), and leave series of other parts of the body out"
+            "study is a cardiac cine, and leave series of other parts of the body out"
         )
 
 

@@ -18,7 +18,7 @@ class SegmentSettings(BaseModel):
     """Share that each neighbouring phase has in a phase's probabilities at 25 phases a beat; with
     fewer, the share falls as the square of their distance grows, as does what it blurs."""
 
-    min_confidence: float = Field(0.5, ge=0, le=1)
+    min_confidence: float = Field(0.4, ge=0, le=1)
     """An image whose labels are trusted less counts as not understood and fails the stage."""
 
     min_ventricle_ml: float = Field(30.0, gt=0)

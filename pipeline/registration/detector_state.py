@@ -10,9 +10,9 @@ from pipeline.geometry import Float, Integer
 TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, FIELDS = range(7)
 # Columns of the state of a lead.
 (
-    LEVEL, NOISE, FLOOR, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
-    SIGN, SCATTER, LEAD_FIELDS,
-) = range(16)  # fmt: skip
+    LEVEL, NOISE, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
+    SIGN, SCATTER, LEAN, LEAN_NOW, PEAK, FINER, HEIGHT_MV, LEAD_FIELDS,
+) = range(20)  # fmt: skip
 # Counters.
 (
     SEEN,
@@ -74,6 +74,8 @@ class State(NamedTuple):
     leads: Float
     shapes: Float
     """``(leads, SHAPE_POINTS)`` usual shape of a beat."""
+    seen: Float
+    """``(leads, SHAPE_POINTS)`` shape of the beat that was measured last."""
     found: Float
     counters: Integer
     numbers: Float

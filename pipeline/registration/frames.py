@@ -43,6 +43,23 @@ class DisplacedSweep:
 
 
 @dataclass(frozen=True, slots=True)
+class Lattice:
+    """The pixels that are looked at in pictures of one geometry."""
+
+    at: Integer
+    """``(samples, 2)`` columns and rows."""
+
+    smoothing: csr_array
+    """``(samples, h * w)``: a Gaussian mean over the sector around each."""
+
+    trend: Float
+    """``(samples, TREND_COLUMNS)``, orthonormal."""
+
+    brightest: float
+    """Largest grey value of the sweep."""
+
+
+@dataclass(frozen=True, slots=True)
 class Samples:
     """Smoothed grey values of all frames at points in tracker space, frame after frame."""
 
@@ -150,24 +167,43 @@ def _sample_sweep(
     sweep: TrackedSweep, phases: Float, spacing_mm: float, smoothing_mm: float
 ) -> Samples:
     """Samples of one sweep; its frames share the pixels that are looked at."""
+    lattice = lattice_of(sweep, spacing_mm, smoothing_mm)
+    usable = np.asarray(np.isfinite(sweep.tracker_from_image).all(axis=(1, 2)))
+    return sample_pictures(lattice, sweep.images, sweep.tracker_from_image, phases, usable)
+
+
+def lattice_of(sweep: TrackedSweep, spacing_mm: float, smoothing_mm: float) -> Lattice:
+    """Where in the pictures of a sweep's geometry is looked, and how samples are taken there.
+
+    Raises
+    ------
+    InputError
+        When the sweep shows no sector, or its transform does not map pixels to millimetres.
+    """
     pixel_mm = _pixel_size_mm(sweep)
     sector = _sector(sweep)
     at = _lattice(sector, pixel_mm, spacing_mm)
     smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
-    seen = (smoothing @ sweep.images.reshape(len(sweep.images), -1).T).T
-    trend = _trend(at * pixel_mm)
-    grey = seen - (seen @ trend) @ trend.T
+    return Lattice(at, smoothing, _trend(at * pixel_mm), float(sweep.images.max()))
+
+
+def sample_pictures(
+    lattice: Lattice, images: Float32, tracker_from_image: Float, phases: Float, usable: Mask
+) -> Samples:
+    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that are not flat."""
+    seen = (lattice.smoothing @ images.reshape(len(images), -1).T).T
+    grey = seen - (seen @ lattice.trend) @ lattice.trend.T
     spread = grey.std(axis=1)
     # A flat picture (the probe in air, a dead frame) has rounding errors for contrast.
-    lively = spread > 1e-3 * max(float(sweep.images.max()), 1e-30)
-    kept = np.flatnonzero(np.isfinite(sweep.tracker_from_image).all(axis=(1, 2)) & lively)
-    pixels = np.column_stack([at, np.zeros(len(at)), np.ones(len(at))])
-    points = np.einsum("fij,sj->fsi", sweep.tracker_from_image[kept, :3], pixels)
+    lively = spread > 1e-3 * max(lattice.brightest, 1e-30)
+    kept = np.flatnonzero(usable & lively)
+    pixels = np.column_stack([lattice.at, np.zeros(len(lattice.at)), np.ones(len(lattice.at))])
+    points = np.einsum("fij,sj->fsi", tracker_from_image[kept, :3], pixels)
     return Samples(
         points.reshape(-1, 3).astype(np.float32),
         (grey[kept] / spread[kept, None]).reshape(-1).astype(np.float32),
-        np.tile(trend, (len(kept), 1)).astype(np.float32),
-        np.arange(len(kept) + 1) * len(at),
+        np.tile(lattice.trend, (len(kept), 1)).astype(np.float32),
+        np.arange(len(kept) + 1) * len(lattice.at),
         phases[kept],
         kept,
     )

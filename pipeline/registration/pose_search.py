@@ -69,11 +69,45 @@ def poses_around(
     return poses
 
 
-def climb_from_best(score: Score, candidates: list[Float], pivot: Pivot, starts: int) -> Float:
-    """The best pose reached, to about a millimetre, from the ``starts`` best candidates."""
+def poses_anywhere(
+    seen_mm: Float, pivot: Pivot, reach_mm: float, count: int, seed: int
+) -> list[Float]:
+    """Poses that put the pivot into the middle of ``seen_mm``, turned in any way.
+
+    Parameters
+    ----------
+    seen_mm
+        ``(n, 3)`` tracker millimetres: what the frames cover.
+    reach_mm
+        How far the pivot may lie from their middle.
+    """
+    rng = np.random.default_rng(seed)
+    middle = seen_mm.mean(axis=0)
+    rotations = Rotation.from_quat(rng.normal(size=(count, 4))).as_matrix()
+    ways = rng.normal(size=(count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    # The cube root spreads evenly over the ball.
+    offsets = reach_mm * np.cbrt(rng.uniform(size=(count, 1))) * ways
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = pivot.centre_mm + offsets - rotations @ middle
+    return list(poses)
+
+
+def climb_from_best(
+    score: Score, candidates: list[Float], pivot: Pivot, starts: int, kept: int
+) -> list[Float]:
+    """The best poses reached, to about a millimetre, from the ``starts`` best candidates.
+
+    At most ``kept``, the best first, no two within 4 mm and 4 degrees of each other.
+    """
     ranked = sorted(candidates, key=score, reverse=True)[:starts]
     reached = [climb(score, pose, pivot, step_mm=1.0, flatness=4e-3) for pose in ranked]
-    return max(reached, key=score)
+    apart: list[Float] = []
+    for pose in sorted(reached, key=score, reverse=True):
+        if all(max(pivot.distance(pose, other)) > 4.0 for other in apart):
+            apart.append(pose)
+    return apart[:kept]
 
 
 def climb(

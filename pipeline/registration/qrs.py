@@ -25,7 +25,6 @@ from pipeline.registration.detector_state import (
     BEST,
     BEST_AT,
     BETWEEN,
-    FLOOR,
     FOUND,
     HEIGHT,
     INTERVALS,
@@ -40,6 +39,7 @@ from pipeline.registration.detector_state import (
     LEARN_AT,
     LEARNT,
     LEVEL,
+    LIKENESS,
     NOISE,
     RUN,
     SEEN,
@@ -51,7 +51,7 @@ from pipeline.registration.detector_state import (
     Plan,
     State,
 )
-from pipeline.registration.waves import time_beat
+from pipeline.registration.waves import learn_beat, measure_beat
 
 REFRACTORY_S = 0.20
 T_WAVE_S = 0.36
@@ -60,6 +60,11 @@ LATE_T_WAVE_S = 0.45
 """The same when a beat is overdue, for then the heart is slow and its T waves are late."""
 THRESHOLD = 0.3
 """Place of the threshold between the levels of noise (0) and of beats (1)."""
+STRANGE_THRESHOLD, STRANGE_LATE = 0.36, 0.20
+"""The same for waves that do not look like the usual beat, P waves and noise among them; and where
+a beat is overdue."""
+VERY_ALIKE = 0.9
+"""Correlation with the usual shape above which a low wave does look like the usual beat."""
 PATIENCE_S = 0.3
 """A low wave is taken for a missed beat no sooner: it may be the P wave of a beat to come."""
 OVERDUE = 1.5
@@ -69,6 +74,16 @@ KNOCK = 8.0
 RUN_S = 0.12
 """A lead that repeats one value for so long shows nothing."""
 SETTLE_S = 0.2
+CLEAR, UNCLEAR = 3.5, 2.0
+"""Beats have at least so many times the energy of what lies between them where they are plain to
+see; waves that have less than so many times are none, or not all of them."""
+MOST_S, LOOK_S = 6.0, 0.25
+"""Where no beat is plain to see after ``LEARN_S`` it is looked for this long, this often."""
+FALL = 0.7
+"""Levels fall no lower at once than to this share, unless a wave looks like the usual beat."""
+SILENCE, SILENCE_S, RECENT_S = 2.5, 2.5, 4.0
+"""After so many RR intervals and seconds without a beat levels are learnt again; and by the waves
+of so many seconds when beats are unclear."""
 
 
 @compiled
@@ -144,24 +159,47 @@ def _filter(k: int, now: int, plan: Plan, s: State) -> None:
 @compiled
 def _learn(middle: int, plan: Plan, s: State) -> None:
     """First levels, from all that has been seen; then decide about all of that."""
-    alive = False
-    first = max(0, middle - plan.learn)
+    first = max(0, middle - plan.length + 4 * plan.half)
+    clear = False
     for k in range(len(s.leads)):
-        seen = np.empty(middle - first + 1)
-        for i in range(first, middle + 1):
-            seen[i - first] = s.energy[k, i % plan.length]
-        seen.sort()
-        s.leads[k, LEVEL] = s.leads[k, FLOOR] = 0.8 * seen[-1]
-        s.leads[k, NOISE] = max(seen[int(0.7 * len(seen))], 0.02 * seen[-1])
-        alive = alive or seen[-1] > 0.0
-    s.counters[LEARN_AT] = s.counters[SEEN]
-    if not alive:
+        level, noise = _levels(k, first, middle, plan, s)
+        s.leads[k, LEVEL] = level
+        s.leads[k, NOISE] = max(noise, 0.02 * level)
+        clear = clear or level > CLEAR * noise
+    # A slow heart may not have beaten yet.
+    s.counters[LEARN_AT] = s.counters[SEEN] + int(LOOK_S * plan.rate_hz) - plan.learn
+    if not clear and (middle - first < MOST_S * plan.rate_hz or s.leads[:, LEVEL].max() <= 0.0):
         return
     s.counters[LEARNT] = 1
     # A record may begin with a beat; none is overdue yet.
     s.counters[LAST_BEAT] = first - int(T_WAVE_S * plan.rate_hz)
     for i in range(first, middle + 1):
         _decide(i, plan, s)
+
+
+@compiled
+def _levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float]:
+    """Energy of a lead's beats and of what lies between them, from a stretch of samples.
+
+    Beats are the highest waves; the one highest of all may be a tug at the electrode.
+    """
+    seen, waves = np.empty(last - first + 1), np.empty(KEPT_WAVES)
+    count, best, best_at = 0, 0.0, first
+    for i in range(first, last + 1):
+        seen[i - first] = s.energy[k, i % plan.length]
+        if seen[i - first] > best:
+            best, best_at = seen[i - first], i
+        elif i - best_at > REFRACTORY_S * plan.rate_hz:
+            if count < KEPT_WAVES:
+                waves[count] = best
+                count += 1
+            best, best_at = 0.0, i
+    seen.sort()
+    if count == 0:
+        return 0.8 * seen[-1], seen[int(0.7 * len(seen))]
+    found = np.sort(waves[:count])
+    high = found[found > 0.4 * found[max(0, count - 2)]]
+    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))]
 
 
 @compiled
@@ -222,7 +260,7 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     # Leads that turned out to be lost since then no longer count.
     _refuse_knocks(at, plan, s)
     height = _height(at, plan, s)
-    if _is_beat(since_s, height, 1.0, s):
+    if _is_beat(since_s, height, 1.0, s) and _resembles(at, height, 1.0, plan, s):
         _accept(at, height, 0.0, plan, s)
         return
     s.numbers[BETWEEN] += 0.125 * (min(height, 0.6) - s.numbers[BETWEEN])
@@ -248,12 +286,19 @@ def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
 def _is_beat(since_s: float, height: float, share: float, s: State) -> bool:
     """Whether a wave so long after a beat and so high exceeds a share of the threshold."""
     between = s.numbers[BETWEEN]
-    late = share < 1.0
-    if since_s < (LATE_T_WAVE_S if late else T_WAVE_S) and height < 0.5 * min(
-        s.numbers[LAST_HEIGHT], 1.2
-    ):
+    bar_s = LATE_T_WAVE_S if share < 1.0 else T_WAVE_S
+    if since_s < bar_s and height < 0.5 * min(s.numbers[LAST_HEIGHT], 1.6):
         return False
-    return bool(height > share * (between + THRESHOLD * (1.0 - between)))
+    return bool(height > between + share * THRESHOLD * (1.0 - between))
+
+
+@compiled
+def _resembles(at: int, height: float, share: float, plan: Plan, s: State) -> bool:
+    """Measure a wave that may be a beat: does it look like one, or is it high enough besides?"""
+    row, between = s.found[s.counters[FOUND]], s.numbers[BETWEEN]
+    measure_beat(at, row, plan, s)
+    strange = between + (STRANGE_THRESHOLD if share == 1.0 else STRANGE_LATE) * (1.0 - between)
+    return bool(row[LIKENESS] >= VERY_ALIKE or height > strange)
 
 
 @compiled
@@ -267,14 +312,40 @@ def _look_back(i: int, plan: Plan, s: State) -> None:
         if fits and (best < 0 or s.waves[k, 1] > s.waves[best, 1]):
             best = k
     if best >= 0:
-        _accept(int(s.waves[best, 0]), s.waves[best, 1], 1.0, plan, s)
-        return
-    fall, slow = math.exp(-1.0 / plan.rate_hz), math.exp(-0.2 / plan.rate_hz)
+        at, height = int(s.waves[best, 0]), s.waves[best, 1]
+        if _resembles(at, height, 0.5, plan, s):
+            _accept(at, height, 1.0, plan, s)
+            return
+        s.waves[best, 1] = 0.0
+    silent_s = (i - max(s.counters[LAST_BEAT], s.counters[LEARN_AT])) / plan.rate_hz
+    if silent_s > max(SILENCE_S, SILENCE * s.numbers[USUAL_RR] / plan.rate_hz):
+        first = s.counters[LAST_BEAT] + int(LATE_T_WAVE_S * plan.rate_hz)
+        _learn_again(first, i - int(PATIENCE_S * plan.rate_hz), plan, s)
+
+
+@compiled
+def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
+    """Beats may have become smaller, or what was taken for beats was none: new levels.
+
+    Levels fall at once if the highest wave looks like a usual beat, and slowly if it does not: it
+    may be a P wave that no beat follows.
+    """
+    s.counters[LEARN_AT] = s.counters[SEEN]
+    first = max(first, last - plan.length + 4 * plan.half, 0)
+    highest = first
+    for i in range(first, last + 1):
+        if s.fused[i % plan.length] > s.fused[highest % plan.length]:
+            highest = i
+    measure_beat(highest, s.found[s.counters[FOUND]], plan, s)
+    least = 0.0 if s.found[s.counters[FOUND], LIKENESS] >= VERY_ALIKE else FALL
     for k in range(len(s.leads)):
+        lead = s.leads[k]
         # A lead that is off says nothing about how large its beats are.
-        if s.leads[k, WEIGHT] > 0.0:
-            s.leads[k, FLOOR] *= slow
-            s.leads[k, LEVEL] = max(s.leads[k, LEVEL] * fall, 0.2 * s.leads[k, FLOOR])
+        if lead[WEIGHT] <= 0.0:
+            continue
+        level, noise = _levels(k, first, last, plan, s)
+        if level > CLEAR * noise:
+            lead[LEVEL], lead[NOISE] = max(level, least * lead[LEVEL]), noise
 
 
 @compiled
@@ -289,12 +360,17 @@ def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
             s.waves[kept, 0], s.waves[kept, 1] = s.waves[k, 0], s.waves[k, 1]
             kept += 1
     s.counters[WAITING] = kept
+    contrast = 0.0
     for k in range(len(s.leads)):
         _learn_level(s.leads[k], s.energy[k, at % plan.length], late)
+        if s.leads[k, WEIGHT] > 0.0:
+            contrast = max(contrast, s.leads[k, LEVEL] / s.leads[k, NOISE])
     row = s.found[s.counters[FOUND]]
     row[KNOWN], row[HEIGHT], row[LATE] = s.counters[SEEN] - 1, height, late
-    time_beat(at, row, plan, s)
+    learn_beat(at, row, plan, s)
     s.counters[FOUND] += 1
+    if contrast < UNCLEAR and at - s.counters[LEARN_AT] > RECENT_S * plan.rate_hz:
+        _learn_again(at - int(RECENT_S * plan.rate_hz), at, plan, s)
 
 
 @compiled
@@ -322,4 +398,3 @@ def _learn_level(lead: Float, energy: float, late: float) -> None:
     elif lead[WEIGHT] > 0.0:
         ratio = min(max(energy / lead[LEVEL], 0.5), 2.0)
         lead[LEVEL] *= ratio ** (0.3 if late > 0.0 else 0.15)
-    lead[FLOOR] = lead[LEVEL]

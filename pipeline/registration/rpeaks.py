@@ -24,8 +24,9 @@ from pipeline.registration.waves import ALIKE
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 100.0, 2000.0
 LATENCY_S = 0.15
 """A beat is known this long after the middle of its QRS complex, and is final then. Two beats are
-known later: those of the first ``LEARN_S``, and overdue ones whose energy was low (``late``)."""
+known later: those while levels are learnt, and overdue ones whose energy was low (``late``)."""
 LEARN_S = 2.0
+"""Levels are learnt for so long, and on to 6 s while no beat stands out."""
 # The wavelet's standard deviation: its band is 6 to 33 Hz at half height, 19 Hz in the middle.
 _WAVELET_S = 0.016
 _HALF_S, _MEAN_S, _CONFIRM_S = 0.050, 0.025, 0.055
@@ -189,6 +190,7 @@ def _state(plan: Plan, leads: int) -> State:
         energy=np.zeros((leads, plan.length)), fused=np.zeros(plan.length),
         waves=np.zeros((at.KEPT_WAVES, 2)), intervals=np.zeros(at.KEPT_INTERVALS),
         leads=np.zeros((leads, at.LEAD_FIELDS)), shapes=np.zeros((leads, at.SHAPE_POINTS)),
+        seen=np.zeros((leads, at.SHAPE_POINTS)),
         found=np.zeros((64, at.FIELDS)), counters=counters, numbers=numbers,
     )  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -27,11 +27,29 @@ class RegisterSettings(BaseModel):
     again is refused."""
     capture_deg: float = Field(20.0, gt=0, le=60)
     """The same for rotation."""
-    starts: int = Field(4, ge=1, le=100)
-    """How many of the most promising poses around the start are followed to their own optimum."""
+    candidates: int = Field(400, ge=1, le=100_000)
+    """How many poses around the start are looked at."""
+    candidates_anywhere: int = Field(12_000, ge=1, le=1_000_000)
+    """How many are looked at where there is no start: the heart in the middle of what the sweeps
+    cover, give or take 2 capture_mm, turned in any way."""
+    starts: int = Field(12, ge=1, le=1000)
+    """How many of the most promising poses are followed to their own optimum; without a start,
+    eight times as many."""
     min_confidence: float = Field(1.6, gt=0)
     """How many times as well as frames in the wrong place (mirrored, or in reverse order) the
     frames must agree with the model; below, the registration is not trusted."""
+    model_error_mm: float = Field(0.5, ge=0, le=10)
+    """Standard deviation of what all frames share, such as the surfaces' error: along each axis in
+    shift, and about each axis at the heart's own radius. No spread between frames shows it."""
+    good_tre_mm: float = Field(1.2, gt=0)
+    """Expected error over the heart up to which a trusted registration is called good."""
+    worst_tre_mm: float = Field(4.0, gt=0)
+    """Expected error over the heart beyond which it is called failed."""
+    accept: Literal["good", "doubtful"] = "doubtful"
+    """The worst verdict that is let pass."""
+    on_failure: Literal["stop", "mr_frame"] = "stop"
+    """What happens to a study that cannot be registered: the stage fails, or the field is made in
+    the frame of the MR."""
     seed: int = 0
     """Of the poses that are tried around the start."""
 
@@ -41,5 +59,10 @@ class RegisterSettings(BaseModel):
             raise ValueError(
                 f"max_frames = {self.max_frames} is under min_frames = {self.min_frames}; "
                 "raise max_frames or lower min_frames"
+            )
+        if self.worst_tre_mm < self.good_tre_mm:
+            raise ValueError(
+                f"worst_tre_mm = {self.worst_tre_mm} is under good_tre_mm = {self.good_tre_mm}; "
+                "raise worst_tre_mm or lower good_tre_mm"
             )
         return self

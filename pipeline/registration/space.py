@@ -1,56 +1,49 @@
 """Bring tracked ultrasound to the MR model in space: one rigid pose for the whole study.
 
 All frames of all sweeps, each at its own phase of the heartbeat, are compared at once with the
-moving surfaces. The search goes from thick blur to thin. Whether its result deserves trust is
-decided by searching the same way with frames whose pictures are the same but in the wrong place
-(mirrored, or in reverse order): their best score is what chance reaches.
+moving surfaces. The search goes from thick blur to thin. What its result is worth is decided by
+its covariance, and by searching the same way with frames whose pictures are the same but in the
+wrong place (mirrored, or in reverse order): their best score is what chance reaches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.errors import InputError, StageError
-from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
-from pipeline.registration.frames import (
-    Samples,
-    TrackedSweep,
-    backwards,
-    choose,
-    mirrored,
-    sample_frames,
-)
-from pipeline.registration.pose_search import (
-    Pivot,
-    climb,
-    climb_from_best,
-    pivot_of,
-    poses_around,
-)
+from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
+from pipeline.registration.frames import TrackedSweep, backwards, mirrored
+from pipeline.registration.pose_search import Pivot, climb
+from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import agreement
-from pipeline.registration.tissue_map import TissueMap, blurred, cavities_of, draw_tissue
+from pipeline.registration.tissue_map import cavities_of
+from pipeline.registration.uncertainty import (
+    curvature_at,
+    expected_tre_mm,
+    floor_of,
+    in_radians,
+    sandwich,
+)
+from pipeline.registration.verdict import Evidence, Grade, Verdict, judge
 
-# The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
-_COARSE_BLUR_MM = 5.0
-_COARSE_SPACING_MM = 9.0
-_COARSE_FRAMES = 24
-_CANDIDATES = 150
 # A frame with less of its picture in blood or at its walls has too little to compare.
 _LEAST_IN_VIEW = 0.05
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
 _STEPS = 6
+# Points of the heart at which the expected error is looked at, of each surface.
+_POINTS = 200
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where the tracker stands in the MR frame, and how well each frame bears it out."""
+    """Where the tracker stands in the MR frame, how sure that is, and what each frame says."""
 
     mr_from_tracker: Float
     """4x4, rigid: tracker millimetres to LPS millimetres."""
@@ -67,66 +60,50 @@ class Registration:
     """Mean over the valid frames of -log(1 - explained share); 0 for no agreement."""
 
     start_score: float
-    """The same, of the same frames, at the start."""
+    """The same, of the same frames, at the start; 0 where there was none."""
 
     confidence: float
     """Score over the best that frames in the wrong place reach; 1 is chance."""
 
+    covariance: Float
+    """``(6, 6)`` of the pose's error: shift along x, y, z (mm), then rotation vector (rad), in the
+    MR frame, about ``centre_mm``."""
+
+    centre_mm: Float
+    """``(3,)`` LPS: the middle of the heart."""
+
+    expected_mm: float
+    """Root mean square of the expected error over the heart."""
+
+    verdict: Grade
+    """``good``, ``doubtful`` or ``failed``."""
+
+    reason: str
+    """Why it is not better; empty for a good one."""
+
+    def expected_tre_mm(self, points_mm: Float) -> Float:
+        """``(n,)`` root mean square target registration error to be expected at ``(n, 3)`` points
+        (LPS mm)."""
+        return expected_tre_mm(self.covariance, self.centre_mm, points_mm)
+
 
 @dataclass(frozen=True, slots=True)
-class _Level:
-    """Frames and model at one degree of blur."""
+class _Found:
+    """A pose, and what it was found with."""
 
-    samples: Samples
-    tissue: TissueMap
-
-    def only(self, frames: Integer) -> _Level:
-        return _Level(choose(self.samples, frames), self.tissue)
-
-    def thinned(self, count: int) -> _Level:
-        return self.only(_evenly(np.arange(self.samples.frames), count))
-
-    def score(self, mr_from_tracker: Float) -> float:
-        return agreement(self.samples, self.tissue, mr_from_tracker).score
-
-
-@dataclass(frozen=True, slots=True)
-class _Search:
-    """Where to look, with what model, and how."""
-
-    candidates: list[Float]
-    pivot: Pivot
-    coarse: TissueMap
-    fine: TissueMap
-    phases: Sequence[Float]
-    settings: RegisterSettings
-
-    def coarse_level(self, sweeps: Sequence[TrackedSweep]) -> _Level:
-        samples = sample_frames(sweeps, self.phases, _COARSE_SPACING_MM, _COARSE_BLUR_MM)
-        return _Level(samples, self.coarse).thinned(_COARSE_FRAMES)
-
-    def fine_level(self, sweeps: Sequence[TrackedSweep]) -> _Level:
-        settings = self.settings
-        samples = sample_frames(
-            sweeps, self.phases, settings.sample_spacing_mm, settings.smoothing_mm
-        )
-        return _Level(samples, self.fine)
-
-    def best(self, sweeps: Sequence[TrackedSweep]) -> tuple[Float, float]:
-        """The pose at which the frames agree best with the model, and their score there."""
-        rough = climb_from_best(
-            self.coarse_level(sweeps).score, self.candidates, self.pivot, self.settings.starts
-        )
-        fine = self.fine_level(sweeps).thinned(self.settings.max_frames)
-        pose = climb(fine.score, rough, self.pivot)
-        return pose, fine.score(pose)
+    pose: Float
+    confidence: float
+    rival: float
+    everything: Level
+    bears_out: Mask
+    """Of the frames of ``everything``."""
 
 
 def register(
     sweeps: Sequence[TrackedSweep],
     phases: Sequence[Float],
     surfaces: Mapping[str, MovingSurface],
-    start: Float,
+    start: Float | None,
     settings: RegisterSettings | None = None,
     progress: Progress | None = None,
 ) -> Registration:
@@ -139,7 +116,8 @@ def register(
     surfaces
         The cavities through the beat, in LPS millimetres; other structures are not looked at.
     start
-        4x4 ``mr_from_tracker``, within the settings' capture range of the truth.
+        4x4 ``mr_from_tracker``, within the settings' capture range of the truth; None: the pose is
+        sought anywhere, the heart somewhere in the middle of what the sweeps cover.
 
     Raises
     ------
@@ -147,56 +125,65 @@ def register(
         When the start is not rigid, frames are too few or never cross the heart near the start,
         phases or transforms do not fit the frames, or no cavity is given.
     StageError
-        When the result cannot be trusted: the frames agree with the model hardly better than
-        frames in the wrong place do, the best pose lies far outside the capture range, or too few
-        frames bear it out.
+        When the verdict is worse than the settings accept.
     """
     settings = settings or RegisterSettings()
+    found = find(sweeps, phases, surfaces, start, settings, progress)
+    if found.verdict == "failed":
+        raise StageError(found.reason)
+    if found.verdict == "doubtful" and settings.accept == "good":
+        raise StageError(f"registration is doubtful, and register.accept is good: {found.reason}")
+    return found
+
+
+def find(
+    sweeps: Sequence[TrackedSweep],
+    phases: Sequence[Float],
+    surfaces: Mapping[str, MovingSurface],
+    start: Float | None,
+    settings: RegisterSettings,
+    progress: Progress | None = None,
+) -> Registration:
+    """As `register`, but a failed registration is returned with its verdict and its reason.
+
+    Raises
+    ------
+    InputError
+        As in `register`.
+    """
     tell = progress or (lambda done, total: None)
-    require_rigid(start, "initial mr_from_tracker")
-    frames = _require_frames(sweeps, phases, settings)
-    search = _prepare(phases, surfaces, start, settings)
+    if start is not None:
+        require_rigid(start, "initial mr_from_tracker")
+    _require_frames(sweeps, phases, settings)
+    search = prepare_search(phases, surfaces, start, settings)
     tell(1, _STEPS)
     _require_heart_in_view(search.coarse_level(sweeps), search)
-    pose, score = search.best(sweeps)
+    best = search.best(sweeps)
     tell(2, _STEPS)
+    # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
+    nearby = replace(search, start=best.pose) if start is None else search
     chance = []
     for step, displaced in enumerate((mirrored, backwards)):
-        chance.append(search.best([displaced(sweep) for sweep in sweeps])[1])
+        chance.append(nearby.best([displaced(sweep) for sweep in sweeps]).score)
         tell(3 + step, _STEPS)
-    confidence = score / max(*chance, np.finfo(float).tiny)
-    _require_trust(confidence, pose, start, search)
     everything = search.fine_level(sweeps)
-    good = np.flatnonzero(_bears_out(everything, pose, search.pivot))
-    _require_enough_valid(len(good), frames, settings)
-    pose = climb(everything.only(good).thinned(settings.max_frames).score, pose, search.pivot)
+    pose = _refined(everything, best.pose, search)
     tell(5, _STEPS)
-    result = _summarise(everything, pose, start, search.pivot, frames, confidence)
+    tiny = np.finfo(float).tiny
+    confidence, rival = best.score / max(*chance, tiny), best.rival / max(best.score, tiny)
+    bears_out = _bears_out(everything, pose, search.pivot)
+    found = _Found(pose, confidence, rival, everything, bears_out)
+    sizes = [len(sweep.images) for sweep in sweeps]
+    heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
+    result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
     return result
 
 
-def _prepare(
-    phases: Sequence[Float],
-    surfaces: Mapping[str, MovingSurface],
-    start: Float,
-    settings: RegisterSettings,
-) -> _Search:
-    """Draw the model and choose the poses to begin from."""
-    tissue = draw_tissue(surfaces, settings.grid_mm)
-    pivot = pivot_of(cavities_of(surfaces))
-    candidates = poses_around(
-        start, pivot, settings.capture_mm, settings.capture_deg, _CANDIDATES, settings.seed
-    )
-    coarse = blurred(tissue, _COARSE_BLUR_MM)
-    fine = blurred(tissue, settings.smoothing_mm)
-    return _Search(candidates, pivot, coarse, fine, phases, settings)
-
-
 def _require_frames(
     sweeps: Sequence[TrackedSweep], phases: Sequence[Float], settings: RegisterSettings
-) -> int:
-    """The number of frames, if it suffices."""
+) -> None:
+    """Refuse fewer frames than are needed."""
     if len(sweeps) != len(phases):
         raise InputError(f"{len(sweeps)} sweeps came with phases for {len(phases)}")
     frames = sum(len(sweep.images) for sweep in sweeps)
@@ -205,21 +192,15 @@ def _require_frames(
             f"{len(sweeps)} sweeps hold {frames} frames; registration needs "
             f"{settings.min_frames} or more: record a longer sweep"
         )
-    return frames
 
 
-def _evenly(frames: Integer, count: int) -> Integer:
-    """At most ``count`` of the frames, evenly spread."""
-    if len(frames) <= count:
-        return frames
-    return np.asarray(frames[np.linspace(0, len(frames) - 1, count).round().astype(int)])
-
-
-def _require_heart_in_view(level: _Level, search: _Search) -> None:
+def _require_heart_in_view(level: Level, search: Search) -> None:
     """Refuse frames that miss the heart wherever the tracker may stand."""
+    if search.start is None:
+        return
     seen = max(
         (agreement(level.samples, level.tissue, pose).in_view > _LEAST_IN_VIEW).sum()
-        for pose in search.candidates
+        for pose in search.candidates(level)
     )
     if seen < min(search.settings.min_frames, level.samples.frames) or seen == 0:
         raise InputError(
@@ -229,34 +210,16 @@ def _require_heart_in_view(level: _Level, search: _Search) -> None:
         )
 
 
-def _require_trust(confidence: float, pose: Float, start: Float, search: _Search) -> None:
-    settings = search.settings
-    if confidence < settings.min_confidence:
-        raise StageError(
-            f"registration found no pose to trust: frames agree with the model {confidence:.2f} "
-            "times as well as frames in the wrong place do, needs "
-            f"{settings.min_confidence:g}; check the start, the phases (is the ECG of this "
-            "recording?), the transforms and the patient"
-        )
-    shift_mm, turn_deg = search.pivot.distance(pose, start)
-    # The candidates reach as far as the capture range; an optimum may lie a little beyond.
-    if shift_mm > 1.5 * settings.capture_mm or turn_deg > 1.5 * settings.capture_deg:
-        raise StageError(
-            f"registration ended {shift_mm:.1f} mm and {turn_deg:.1f} degrees from the start, "
-            f"far outside the {settings.capture_mm:g} mm and {settings.capture_deg:g} degrees "
-            "that were searched; give a better start or widen capture_mm and capture_deg"
-        )
+def _refined(everything: Level, pose: Float, search: Search) -> Float:
+    """The pose that those frames find that bear the present one out, if they suffice."""
+    good = np.flatnonzero(_bears_out(everything, pose, search.pivot))
+    if len(good) < search.settings.min_frames:
+        return pose
+    level = everything.only(good).thinned(search.settings.max_frames)
+    return climb(level.score, pose, search.pivot)
 
 
-def _require_enough_valid(valid: int, frames: int, settings: RegisterSettings) -> None:
-    if valid < settings.min_frames:
-        raise StageError(
-            f"only {valid} of {frames} frames bear the registration out, needs "
-            f"{settings.min_frames}; record sweeps that cross more of the heart"
-        )
-
-
-def _bears_out(level: _Level, pose: Float, pivot: Pivot) -> Mask:
+def _bears_out(level: Level, pose: Float, pivot: Pivot) -> Mask:
     """Which frames meet the heart, agree as others do, and better here than at poses nearby."""
     here = agreement(level.samples, level.tissue, pose)
     # Far enough to leave the optimum, near enough to see the same parts.
@@ -269,14 +232,61 @@ def _bears_out(level: _Level, pose: Float, pivot: Pivot) -> Mask:
     return np.asarray((here.in_view > _LEAST_IN_VIEW) & usual & peak)
 
 
+def _some(points_mm: Float) -> Float:
+    """At most some hundred of the points, evenly through their order."""
+    return points_mm[:: max(1, len(points_mm) // _POINTS)]
+
+
+def _covariance(found: _Found, search: Search, sizes: Sequence[int]) -> Float:
+    """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor."""
+    judged = found.everything
+    if found.bears_out.sum() >= search.settings.min_frames:
+        judged = judged.only(np.flatnonzero(found.bears_out))
+    judged = judged.thinned(search.settings.max_frames)
+
+    def losses(step_mm: Float) -> Float:
+        pose = search.pivot.move(found.pose, step_mm)
+        return np.log1p(-agreement(judged.samples, judged.tissue, pose).explained)
+
+    sweep = np.searchsorted(np.cumsum(sizes), judged.samples.number, side="right")
+    spread = in_radians(sandwich(curvature_at(losses), sweep), search.pivot)
+    return np.asarray(spread + floor_of(search.settings.model_error_mm, search.pivot))
+
+
 def _summarise(
-    level: _Level, pose: Float, start: Float, pivot: Pivot, frames: int, confidence: float
+    found: _Found, search: Search, sizes: Sequence[int], heart_mm: Float
 ) -> Registration:
-    """Judge every frame of the study at the final pose."""
-    bears_out = _bears_out(level, pose, pivot)
-    judged = level.only(np.flatnonzero(bears_out))
+    """Judge every frame of the study, and the pose itself."""
+    level, pose, pivot = found.everything, found.pose, search.pivot
+    frames = sum(sizes)
+    covariance = _covariance(found, search, sizes)
+    expected = expected_tre_mm(covariance, pivot.centre_mm, heart_mm)
+    verdict = _verdict(found, search, frames, float(np.sqrt((expected**2).mean())))
+    judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
     residual = np.ones(frames)
     residual[level.samples.number] = 1 - agreement(level.samples, level.tissue, pose).explained
     valid = np.zeros(frames, dtype=bool)
-    valid[level.samples.number] = bears_out
-    return Registration(pose, residual, valid, judged.score(pose), judged.score(start), confidence)
+    valid[level.samples.number] = found.bears_out
+    return Registration(
+        mr_from_tracker=pose,
+        residual=residual,
+        valid=valid,
+        score=judged.score(pose),
+        start_score=0.0 if search.start is None else judged.score(search.start),
+        confidence=found.confidence,
+        covariance=covariance,
+        centre_mm=pivot.centre_mm,
+        expected_mm=float(np.sqrt((expected**2).mean())),
+        verdict=verdict.grade,
+        reason=verdict.reason,
+    )
+
+
+def _verdict(found: _Found, search: Search, frames: int, expected_mm: float) -> Verdict:
+    shift_mm, turn_deg = (
+        (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
+    )
+    valid = int(found.bears_out.sum())
+    sure = found.confidence, found.rival
+    evidence = Evidence(*sure, expected_mm, valid, frames, shift_mm, turn_deg)
+    return judge(evidence, search.settings)

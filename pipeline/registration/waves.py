@@ -13,9 +13,14 @@ import numpy as np
 from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
 from pipeline.registration.detector_state import (
+    FINER,
+    HEIGHT_MV,
     LEAD,
+    LEAN,
+    LEAN_NOW,
     LIKENESS,
     OFFSET,
+    PEAK,
     SCATTER,
     SHAPE_POINTS,
     SHIFT,
@@ -44,8 +49,11 @@ ALIKE = 0.75
 """Correlation with the usual shape above which a beat has that shape."""
 FORGET_SHAPE = 8
 """After so many beats in succession of other shapes the last one is the usual one."""
-_OTHER_WAY = 1.3
-"""A deflection against a lead's usual direction must be so much larger to be its main one."""
+_OTHER_WAY = 0.13
+"""A deflection against a lead's usual direction is the main one of a beat of another shape if it is
+larger by this share of the sum of both."""
+_TURNED = 0.05
+"""The usual direction changes when on average the other one is larger by this share."""
 
 
 @compiled
@@ -92,8 +100,8 @@ def above_rest(window: Float, before: int, rate_hz: float) -> Float:
 
 
 @compiled
-def main_deflection(away: Float, bend: Float, way: float) -> tuple[int, float]:
-    """Sample of the largest deflection, and its height (signed).
+def deflection(away: Float, bend: Float, side: float) -> int:
+    """Sample of the largest deflection to one side (1 up, -1 down).
 
     Largest is what lies far from rest and is bent besides: far alone would take an ST segment
     that the scanner lifts for rest, bent alone would take the onset of a wide wave for its summit.
@@ -102,23 +110,14 @@ def main_deflection(away: Float, bend: Float, way: float) -> tuple[int, float]:
     ----------
     away, bend
         ``(n,)`` lead against its rest, and the wavelet's even part, about the complex.
-    way
-        Direction in which this lead's beats usually point, 0 where that is not known.
     """
     far, sharp = max(np.abs(away).max(), 1e-300), max(np.abs(bend).max(), 1e-300)
-    rise, fall = 0.0, 0.0
-    up, down = len(away) // 2, len(away) // 2
+    place, most = len(away) // 2, 0.0
     for i in range(1, len(away) - 1):
-        score = away[i] / far + bend[i] / sharp
-        if score > rise:
-            up, rise = i, score
-        if -score > fall:
-            down, fall = i, -score
-    if way > 0:
-        rise *= _OTHER_WAY
-    elif way < 0:
-        fall *= _OTHER_WAY
-    return (up, abs(away[up])) if rise >= fall else (down, -abs(away[down]))
+        score = side * (away[i] / far + bend[i] / sharp)
+        if score > most:
+            place, most = i, score
+    return place
 
 
 @compiled
@@ -156,65 +155,95 @@ def read_shape(
 
 
 @compiled
-def time_beat(at: int, row: Float, plan: Plan, s: State) -> None:
+def measure_beat(at: int, row: Float, plan: Plan, s: State) -> None:
     """Time R by all leads that show it, and compare its shape with the usual one."""
-    count = len(s.leads)
-    times, shapes = np.zeros(count), np.zeros((count, SHAPE_POINTS))
     likeness, weights, best = 0.0, 0.0, 0
-    for k in range(count):
-        if s.leads[k, WEIGHT] <= 0.0:
+    for k in range(len(s.leads)):
+        lead = s.leads[k]
+        if lead[WEIGHT] <= 0.0:
             continue
-        times[k] = _time_lead(k, at, shapes[k], plan, s)
-        alike = 0.0
-        for j in range(SHAPE_POINTS):
-            alike += shapes[k, j] * s.shapes[k, j]
-        if s.leads[k, TIMED] > 0.0:
-            likeness += s.leads[k, WEIGHT] * alike
-            weights += s.leads[k, WEIGHT]
-        if s.leads[k, WEIGHT] > s.leads[best, WEIGHT]:
+        lead[PEAK] = _time_lead(k, at, s.seen[k], plan, s)
+        if lead[TIMED] > 0.0:
+            likeness += lead[WEIGHT] * (s.seen[k] * s.shapes[k]).sum()
+            weights += lead[WEIGHT]
+        if lead[WEIGHT] > s.leads[best, WEIGHT]:
             best = k
     likeness = likeness / weights if weights > 0.0 else 1.0
-    usual = likeness >= ALIKE
-    s.counters[STRANGE] = 0 if usual else s.counters[STRANGE] + 1
-    together = _common_time(times, usual, best, s)
     row[LEAD], row[LIKENESS] = best, likeness
-    row[TIME] = (at + together) / plan.rate_hz
-    if usual or s.counters[STRANGE] >= FORGET_SHAPE:
-        _learn_shapes(times, shapes, together, s)
+    row[TIME] = (at + _common_time(likeness >= ALIKE, s)) / plan.rate_hz
+
+
+@compiled
+def learn_beat(at: int, row: Float, plan: Plan, s: State) -> None:
+    """Let what is usual follow the beat that was measured last."""
+    if at < BEFORE_S * plan.rate_hz:
+        # The record began within this beat.
+        return
+    usual = row[LIKENESS] >= ALIKE
+    s.counters[STRANGE] = 0 if usual else s.counters[STRANGE] + 1
+    if usual or s.counters[STRANGE] >= _patience(s):
+        _learn_shapes(row[TIME] * plan.rate_hz - at, plan, s)
+
+
+@compiled
+def _patience(s: State) -> float:
+    """How many beats of other shapes make another shape the usual one: few, where few are known."""
+    return float(min(s.leads[:, TIMED].max() + 1.0, float(FORGET_SHAPE)))
 
 
 @compiled
 def _time_lead(k: int, at: int, shape: Float, plan: Plan, s: State) -> float:
-    """When a lead's main deflection peaks, in samples after the complex's middle."""
+    """When a lead's main deflection peaks, in samples after the complex's middle.
+
+    A lead whose R and S are about as large keeps to the one it was timed by, as long as that looks
+    as usual: they are some 20 to 30 ms apart.
+    """
     lead, rate_hz = s.leads[k], plan.rate_hz
-    before, after = int(BEFORE_S * rate_hz), int(AFTER_S * rate_hz)
-    window = smooth_window(s.raw[k], plan.length, at, before, after, s.coarse)
-    around = int(SEARCH_S * rate_hz)
+    around, before = int(SEARCH_S * rate_hz), int(BEFORE_S * rate_hz)
+    window = smooth_window(s.raw[k], plan.length, at, before, int(AFTER_S * rate_hz), s.coarse)
     away = above_rest(window, before, rate_hz)[before - around : before + around + 1]
     bend = smooth_window(s.raw[k], plan.length, at, around, around, s.even)
-    peak, size = main_deflection(away, bend, lead[WAY])
-    sign, peak = 1.0 if size > 0.0 else -1.0, peak - around
-    reach = max(1, int(CLIMB_S * rate_hz))
-    shift = summit(s.raw[k], plan.length, at + peak, sign, s.coarse, reach)
-    read_shape(s.raw[k], plan.length, at + peak + shift, rate_hz, s.even, shape)
-    finer = summit(s.raw[k], plan.length, at + peak, sign, s.fine, reach) - shift
-    lead[SIGN] = sign
+    # Bends alone tell the main side, for what the scanner adds to the ST segment is smooth.
+    rise, fall = max(bend[1:-1].max(), 0.0), max(-bend[1:-1].min(), 0.0)
+    lead[LEAN_NOW] = (rise - fall) / max(rise + fall, 1e-300)
     if lead[TIMED] == 0.0:
-        lead[SHIFT], lead[SIZE_MV], lead[WAY] = finer, abs(size), sign
-    elif sign * lead[WAY] > 0.0:
-        # What smoothing moves is the same in every beat; noise is not.
-        limit = 0.003 * rate_hz
-        lead[SCATTER] += 0.1 * (min(abs(finer - lead[SHIFT]), limit) - lead[SCATTER])
-        lead[SHIFT] += 0.1 * min(max(finer - lead[SHIFT], -limit), limit)
-        lead[SIZE_MV] += 0.1 * (abs(size) - lead[SIZE_MV])
-    if sign * lead[WAY] < 0.0:
-        return peak + shift
-    trust = 1.0 / (1.0 + (lead[SCATTER] / (0.001 * rate_hz)) ** 2)
-    return float(peak + shift + trust * lead[SHIFT])
+        lead[WAY] = 1.0 if rise >= fall else -1.0
+        lead[LEAN] = lead[LEAN_NOW]
+    lead[SIGN] = lead[WAY]
+    place = deflection(away, bend, lead[SIGN])
+    peak = _climb(k, at, place - around, shape, plan, s)
+    if lead[LEAN_NOW] * lead[WAY] < -_OTHER_WAY and (shape * s.shapes[k]).sum() < ALIKE:
+        lead[SIGN] = -lead[WAY]
+        place = deflection(away, bend, lead[SIGN])
+        peak = _climb(k, at, place - around, shape, plan, s)
+    return _refine(k, at, place - around, peak, abs(away[place]), plan, s)
 
 
 @compiled
-def _common_time(times: Float, usual: bool, best: int, s: State) -> float:
+def _climb(k: int, at: int, place: int, shape: Float, plan: Plan, s: State) -> float:
+    """The summit near a sample, in samples after the complex's middle; and the shape about it."""
+    reach = max(1, int(CLIMB_S * plan.rate_hz))
+    sign = s.leads[k, SIGN]
+    peak = place + summit(s.raw[k], plan.length, at + place, sign, s.coarse, reach)
+    read_shape(s.raw[k], plan.length, at + peak, plan.rate_hz, s.even, shape)
+    return float(peak)
+
+
+@compiled
+def _refine(k: int, at: int, place: int, peak: float, size: float, plan: Plan, s: State) -> float:
+    """The peak with what smoothing moves it by, which is the same in every beat; noise is not."""
+    lead, rate_hz = s.leads[k], plan.rate_hz
+    reach = max(1, int(CLIMB_S * rate_hz))
+    finer = place - peak + summit(s.raw[k], plan.length, at + place, lead[SIGN], s.fine, reach)
+    if lead[SIGN] != lead[WAY]:
+        return peak
+    lead[FINER], lead[HEIGHT_MV] = finer, size
+    shift, scatter = (lead[SHIFT], lead[SCATTER]) if lead[TIMED] > 0.0 else (finer, 0.0)
+    return float(peak + shift / (1.0 + (scatter / (0.001 * rate_hz)) ** 2))
+
+
+@compiled
+def _common_time(usual: bool, s: State) -> float:
     """One time of the leads that agree with the best one.
 
     In a lead such as V1 the largest deflection is S, which follows R by some 30 ms; leads keep
@@ -222,20 +251,20 @@ def _common_time(times: Float, usual: bool, best: int, s: State) -> float:
     the leads decides.
     """
     if not usual:
-        return _lower_median(times, s)
+        return _lower_median(s)
     total, weights = 0.0, 0.0
-    for k in range(len(times)):
+    for k in range(len(s.leads)):
         weight = s.leads[k, WEIGHT] if s.leads[k, TIMED] > 0.0 else 0.0
-        own = times[k] - s.leads[k, OFFSET]
+        own = s.leads[k, PEAK] - s.leads[k, OFFSET]
         if weight > 0.0:
             total += weight * own
             weights += weight
-    return float(total / weights) if weights > 0.0 else _lower_median(times, s)
+    return float(total / weights) if weights > 0.0 else _lower_median(s)
 
 
 @compiled
-def _lower_median(times: Float, s: State) -> float:
-    alive = times[s.leads[:, WEIGHT] > 0.0]
+def _lower_median(s: State) -> float:
+    alive = s.leads[s.leads[:, WEIGHT] > 0.0][:, PEAK]
     if len(alive) == 0:
         return 0.0
     alive.sort()
@@ -243,28 +272,50 @@ def _lower_median(times: Float, s: State) -> float:
 
 
 @compiled
-def _learn_shapes(times: Float, shapes: Float, together: float, s: State) -> None:
+def _learn_shapes(together: float, plan: Plan, s: State) -> None:
     """Let the usual shape, direction and offset of every lead follow this beat."""
-    anew = s.counters[STRANGE] >= FORGET_SHAPE
-    for k in range(len(times)):
+    anew = s.counters[STRANGE] > 0
+    for k in range(len(s.leads)):
         lead = s.leads[k]
         if lead[WEIGHT] <= 0.0:
             continue
-        lead[WAY] = lead[SIGN] if anew else lead[WAY]
-        lead[TIMED] = 1.0 if anew else min(lead[TIMED] + 1.0, 64.0)
+        if anew:
+            lead[WAY], lead[LEAN], lead[TIMED] = lead[SIGN], lead[LEAN_NOW], 0.0
+        elif lead[SIGN] != lead[WAY]:
+            continue
+        _learn_size(lead, plan)
+        lead[TIMED] = min(lead[TIMED] + 1.0, 64.0)
         share = max(1.0 / lead[TIMED], 0.02)
-        lead[OFFSET] += share * (times[k] - together - lead[OFFSET])
+        lead[LEAN] += share * (lead[LEAN_NOW] - lead[LEAN])
+        lead[OFFSET] += share * (lead[PEAK] - together - lead[OFFSET])
         follow = max(1.0 / lead[TIMED], 0.1)
         for j in range(SHAPE_POINTS):
-            s.shapes[k, j] += follow * (shapes[k, j] - s.shapes[k, j])
+            s.shapes[k, j] += follow * (s.seen[k, j] - s.shapes[k, j])
+        if lead[LEAN] * lead[WAY] < -_TURNED:
+            # From the next beat on this lead is timed by its other side.
+            lead[TIMED] = 0.0
     s.counters[STRANGE] = 0
     _centre_offsets(s)
+
+
+@compiled
+def _learn_size(lead: Float, plan: Plan) -> None:
+    """How high beats are, and by how much smoothing moves their summit."""
+    if lead[TIMED] == 0.0:
+        lead[SHIFT], lead[SIZE_MV], lead[SCATTER] = lead[FINER], lead[HEIGHT_MV], 0.0
+        return
+    limit = 0.003 * plan.rate_hz
+    lead[SCATTER] += 0.1 * (min(abs(lead[FINER] - lead[SHIFT]), limit) - lead[SCATTER])
+    lead[SHIFT] += 0.1 * min(max(lead[FINER] - lead[SHIFT], -limit), limit)
+    lead[SIZE_MV] += 0.1 * (lead[HEIGHT_MV] - lead[SIZE_MV])
 
 
 @compiled
 def _centre_offsets(s: State) -> None:
     """Offsets are against the earlier half of the leads, for S follows R; on average, not once."""
     timed = s.leads[s.leads[:, TIMED] > 0.0]
+    if len(timed) == 0:
+        return
     offsets = np.sort(timed[:, OFFSET])
-    middle = offsets[(len(offsets) - 1) // 2] * max(1.0 / timed[:, TIMED].max(), 0.02)
+    middle = offsets[(len(offsets) - 1) // 2] * max(1.0 / timed[:, TIMED].min(), 0.1)
     s.leads[:, OFFSET] -= middle

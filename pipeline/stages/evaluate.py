@@ -172,12 +172,15 @@ def _registration(job: Job, truth: Path, known: dict[str, Any]) -> dict[str, Any
     heart = read_mesh(truth / "surfaces" / "heart_000.vtp")
     targets_mm = heart.vertices_mm
     missed_mm = target_registration_error_mm(np.array(found), true, targets_mm)
-    started = np.array(job.study.us.initial_mr_from_tracker if job.study.us else np.eye(4))
-    start_mm = target_registration_error_mm(started, true, targets_mm)
+    given = job.study.us.initial_mr_from_tracker if job.study.us else None
+    start = {}
+    if given is not None:
+        start_mm = target_registration_error_mm(np.array(given), true, targets_mm)
+        start = {"start_mean": round(float(start_mm.mean()), 3)}
     errors = np.abs(_frame_phase_errors(job, known))
     return {
         "target_registration_error_mm": {
-            "start_mean": round(float(start_mm.mean()), 3),
+            **start,
             "mean": round(float(missed_mm.mean()), 3),
             "largest": round(float(missed_mm.max()), 3),
         },

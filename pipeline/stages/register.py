@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry import Float, require_rigid
+from pipeline.errors import StageError
+from pipeline.geometry import Float, MovingSurface, require_rigid
 from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, read_sweep
 from pipeline.job import Job, Skipped
@@ -17,14 +18,16 @@ from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
 
 def run(job: Job) -> dict[str, Any]:
     """Write ``mr_from_tracker.json`` and ``frames.csv``."""
+    if job.study.us is None:
+        raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
     start = _start(job)
-    sweeps = [read_sweep(path) for path in job.study.us.sweeps] if job.study.us else []
+    sweeps = [read_sweep(path) for path in job.study.us.sweeps]
     r_times_s = _r_times_s(job)
-    phases = [phases_at(sweep.times_s, r_times_s) for sweep in sweeps]
-    cycle = np.array(read_table(job.products / "ingest" / "phases.json")["phases"])
+    timing = read_table(job.products / "ingest" / "phases.json")
+    cycle, cycle_rr_s = np.array(timing["phases"]), timing.get("rr_s")
+    phases = [phases_at(sweep.times_s, r_times_s, cycle_rr_s) for sweep in sweeps]
     surfaces = read_surfaces(job.products / "surface", cycle)
-    settings = job.settings.register_
-    found = register(sweeps, phases, surfaces, start, settings, job.progress)
+    found = _registered(job, sweeps, phases, surfaces, start)
     _write(job, found, _rows(sweeps, phases, found))
     return {
         "frames": len(found.valid),
@@ -32,23 +35,39 @@ def run(job: Job) -> dict[str, Any]:
         "score": round(found.score, 5),
         "start_score": round(found.start_score, 5),
         "confidence": round(found.confidence, 2),
+        "verdict": found.verdict,
+        "reason": found.reason,
+        "expected_tre_mm": round(found.expected_mm, 3),
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
     }
 
 
-def _start(job: Job) -> Float:
-    """The first guess of where the tracker stands, as the study gives it."""
-    if job.study.us is None:
-        raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
+def _start(job: Job) -> Float | None:
+    """The first guess of where the tracker stands; None where the study gives none."""
+    assert job.study.us is not None, "only a study with ultrasound is registered"
     given = job.study.us.initial_mr_from_tracker
     if given is None:
-        raise Skipped(
-            "tracked ultrasound without a first guess: give us.initial_mr_from_tracker in "
-            "study.yaml; the field is in the frame of the MR"
-        )
+        return None
     start = np.array(given, dtype=float)
     require_rigid(start, f"{job.study.folder}/study.yaml: us.initial_mr_from_tracker")
     return start
+
+
+def _registered(
+    job: Job,
+    sweeps: list[Sweep],
+    phases: list[Float],
+    surfaces: dict[str, MovingSurface],
+    start: Float | None,
+) -> Registration:
+    """The registration; where there is none and the user wants it so, the MR's frame."""
+    settings = job.settings.register_
+    try:
+        return register(sweeps, phases, surfaces, start, settings, job.progress)
+    except StageError as error:
+        if settings.on_failure == "stop":
+            raise
+        raise Skipped(f"{error}; the field is in the frame of the MR") from error
 
 
 def _r_times_s(job: Job) -> Float:
@@ -72,6 +91,16 @@ def _rows(sweeps: list[Sweep], phases: list[Float], found: Registration) -> list
 def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
     write_table(
         job.folder / "mr_from_tracker.json",
-        {"mr_from_tracker": found.mr_from_tracker.tolist(), "frame": "LPS", "unit": "mm"},
+        {
+            "mr_from_tracker": found.mr_from_tracker.tolist(),
+            "frame": "LPS",
+            "unit": "mm",
+            "covariance": found.covariance.tolist(),
+            "covariance_units": "mm, rad about centre_mm",
+            "centre_mm": found.centre_mm.tolist(),
+            "expected_tre_mm": round(found.expected_mm, 3),
+            "verdict": found.verdict,
+            "reason": found.reason,
+        },
     )
     write_frames(job.folder / "frames.csv", rows)

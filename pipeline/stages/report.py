@@ -97,6 +97,9 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     if job.product("register"):
         register = figures_of(job, "register")
         rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
+        expected = f"an error of {register['expected_tre_mm']:.1f} mm is to be expected"
+        said = [register["verdict"], expected, register["reason"]]
+        rows.append(("registration", "; ".join(filter(None, said))))
     largest = accuracy["distance_error_max_mm"]
     rows.append(("largest distance error of the field", f"{largest:.3f} mm"))
     return rows

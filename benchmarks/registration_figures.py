@@ -1,0 +1,242 @@
+"""How truly, how surely and how fast tracked ultrasound is registered, over unseen studies.
+
+    python benchmarks/registration_figures.py OUT [--studies 100] [--seed 3001] [--starts 2]
+        [--surfaces truth|PRODUCTS] [--peer 20] [--global 0]
+
+Studies differ in anatomy, illness, probe, number of frames, share of frames lost and noise; each is
+registered from starts of up to 20 mm and 20 degrees off. ``--surfaces`` names a folder of products,
+one a patient named ``<seed>-<pathology>`` as benchmarks/segmentation_figures.py leaves them, to
+register to what the pipeline found in the cine rather than to the phantom's own meshes; seeds with
+no products are then left out. ``--peer N`` runs SimpleITK's mutual information beside it on the
+first N studies, ``--global N`` registers the first N without any start. Results are kept line by
+line in OUT/results.jsonl; what is there is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from registration_peer import compounded, mr_volume, mutual_information
+from registration_studies import (
+    PATHOLOGIES,
+    SETUPS,
+    Order,
+    Study,
+    found_surfaces,
+    make_study,
+    start_of,
+    true_surfaces,
+)
+
+from data_synth.simulate import load_heart
+from pipeline.errors import BeatfieldError
+from pipeline.geometry import Float, MovingSurface, transform_points
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.space import find
+
+FRAMES = (40, 80, 20, 160, 10, 80, 400)
+DROPOUT = (0.0, 0.2, 0.4, 0.6)
+SNR_DB = (None, 20.0, 10.0)
+CAPTURED_MM = 2.0
+SHARES = (1.0, 0.5, 0.75, 0.25)
+"""Of 20 mm and 20 degrees: how far off the starts of a study are, in turn."""
+
+
+def orders(first_seed: int, count: int, products: Path | None) -> Iterator[Order]:
+    """The studies; what varies goes round with periods that share no factor, or nearly so."""
+    for k in range(count):
+        seed = first_seed + k
+        illness = PATHOLOGIES[k % len(PATHOLOGIES)]
+        if products is not None:
+            match = sorted(products.glob(f"{seed}-*"))
+            if not match:
+                continue
+            illness = match[0].name.split("-", 1)[1]
+        yield Order(
+            seed=seed,
+            pathology=illness,
+            probe=SETUPS[k % len(SETUPS)],
+            frames=FRAMES[k % len(FRAMES)],
+            dropout=DROPOUT[(k // 2) % len(DROPOUT)],
+            snr_db=SNR_DB[(k // 3) % len(SNR_DB)],
+        )
+
+
+def error_mm(study: Study, pose: Float) -> Float:
+    """Target registration error at the points of the heart."""
+    tracker = transform_points(np.asarray(np.linalg.inv(study.mr_from_tracker)), study.targets_mm)
+    return np.asarray(np.linalg.norm(transform_points(pose, tracker) - study.targets_mm, axis=1))
+
+
+def registered(
+    study: Study, surfaces: dict[str, MovingSurface], start: Float | None
+) -> dict[str, Any]:
+    """One registration: errors, verdict and seconds."""
+    began = time.perf_counter(), time.process_time()
+    try:
+        found = find(study.sweeps, study.phases, surfaces, start, RegisterSettings())
+    except BeatfieldError as refusal:
+        return {"verdict": "refused", "reason": str(refusal)}
+    wall_s, cpu_s = time.perf_counter() - began[0], time.process_time() - began[1]
+    error = error_mm(study, found.mr_from_tracker)
+    return {
+        "mean_mm": float(error.mean()),
+        "quantiles_mm": np.quantile(error, np.linspace(0, 1, 21)).tolist(),
+        "expected_mm": found.expected_mm,
+        "confidence": found.confidence,
+        "valid": float(found.valid.mean()),
+        "verdict": found.verdict,
+        "reason": found.reason,
+        "wall_s": wall_s,
+        "cpu_s": cpu_s,
+    }
+
+
+def peer(order: Order, study: Study, start: Float) -> dict[str, Any]:
+    """The same by mutual information."""
+    heart = load_heart(order.settings())
+    moving = mr_volume(heart, np.random.default_rng([order.seed, 5]))
+    began = time.perf_counter()
+    try:
+        fixed, mask = compounded(
+            [sweep.images.astype(float) for sweep in study.sweeps],
+            [sweep.tracker_from_image for sweep in study.sweeps],
+            study.phases,
+        )
+        pose = mutual_information(fixed, mask, moving, start, heart.centre_mm)
+    except (ValueError, RuntimeError) as refusal:
+        return {"verdict": "refused", "reason": str(refusal).splitlines()[-1]}
+    error = error_mm(study, pose)
+    return {
+        "mean_mm": float(error.mean()),
+        "quantiles_mm": np.quantile(error, np.linspace(0, 1, 21)).tolist(),
+        "wall_s": time.perf_counter() - began,
+    }
+
+
+def work(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Do what has not been done yet; all results."""
+    path = arguments.out / "results.jsonl"
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {(one["study"], one["method"], one["start"]) for one in results}
+    products = None if arguments.surfaces == "truth" else Path(arguments.surfaces)
+    with path.open("a") as handle:
+        for number, order in enumerate(orders(arguments.seed, arguments.studies, products)):
+            for method, start in tasks(arguments, number):
+                if (order.name, method, start) not in done:
+                    one = result_of(order, method, start, arguments.out, products)
+                    results.append(one)
+                    handle.write(json.dumps(one) + "\n")
+                    handle.flush()
+    return results
+
+
+def tasks(arguments: argparse.Namespace, number: int) -> list[tuple[str, int]]:
+    """Methods and numbers of starts for one study."""
+    ours = [("beatfield", start) for start in range(arguments.starts)]
+    ours += [("global", 0)] if number < arguments.without_start else []
+    return ours + ([("peer", 0)] if number < arguments.peer else [])
+
+
+def result_of(
+    order: Order, method: str, start: int, folder: Path, products: Path | None
+) -> dict[str, Any]:
+    """One line of the results."""
+    study = make_study(order, folder / "studies")
+    share = SHARES[start % len(SHARES)]
+    guess = start_of(study, 100 * order.seed + start, 20 * share, 20 * share)
+    if method == "peer":
+        measured = peer(order, study, guess)
+    else:
+        surfaces = (
+            true_surfaces(order)
+            if products is None
+            else found_surfaces(products / f"{order.seed}-{order.pathology}")
+        )
+        measured = registered(study, surfaces, None if method == "global" else guess)
+    about = {"study": order.name, "method": method, "start": start, "share": share}
+    keys = ("probe", "frames", "dropout", "snr_db", "pathology")
+    return about | {key: getattr(order, key) for key in keys} | measured
+
+
+def line(name: str, some: list[dict[str, Any]]) -> str:
+    """One row of a table."""
+    whole = [one for one in some if "mean_mm" in one]
+    if not whole:
+        return f"| {name} | {len(some)} | | | | | |"
+    points = np.concatenate([one["quantiles_mm"] for one in whole])
+    means = np.array([one["mean_mm"] for one in whole])
+    seconds = [one["wall_s"] for one in whole]
+    # What is refused at the door ends nowhere: it counts as not captured.
+    captured = (means < CAPTURED_MM).sum() / len(some)
+    return (
+        f"| {name} | {len(some)} | {np.median(points):.2f} | {np.quantile(points, 0.95):.2f} | "
+        f"{np.median(means):.2f} | {captured:.1%} | {np.median(seconds):.1f} |"
+    )
+
+
+HEAD = (
+    "| | runs | median TRE (mm) | 95th percentile | median of means | under 2 mm | seconds |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def tables(results: list[dict[str, Any]]) -> str:
+    """All results as Markdown."""
+    ours = [one for one in results if one["method"] == "beatfield"]
+    text = [HEAD]
+    names = {"beatfield": "beatfield", "global": "without a start", "peer": "SimpleITK MI"}
+    for method, name in names.items():
+        some = [one for one in results if one["method"] == method]
+        text += [line(name, some)] if some else []
+    both = {one["study"] for one in results if one["method"] == "peer"}
+    if both:
+        same = [one for one in ours if one["study"] in both and one["start"] == 0]
+        text.append(line("beatfield, the same as SimpleITK MI", same))
+    for key in ("share", "probe", "frames", "dropout", "snr_db", "pathology"):
+        text += ["", f"By {key}:", "", HEAD]
+        for value in sorted({str(one[key]) for one in ours}):
+            text.append(line(value, [one for one in ours if str(one[key]) == value]))
+    return "\n".join([*text, "", *calibration(ours)])
+
+
+def calibration(results: list[dict[str, Any]]) -> list[str]:
+    """What the verdicts and the expected errors are worth."""
+    text = ["| verdict | runs | under 2 mm | median expected (mm) | root mean square error (mm) |"]
+    text.append("|---|---|---|---|---|")
+    for verdict in ("good", "doubtful", "failed", "refused"):
+        some = [one for one in results if one["verdict"] == verdict]
+        whole = [one for one in some if "mean_mm" in one]
+        if not whole:
+            text.append(f"| {verdict} | {len(some)} | | | |")
+            continue
+        means = np.array([one["mean_mm"] for one in whole])
+        expected = np.median([one["expected_mm"] for one in whole])
+        rms = np.sqrt((means**2).mean())
+        under = f"{(means < CAPTURED_MM).mean():.1%}"
+        text.append(f"| {verdict} | {len(some)} | {under} | {expected:.2f} | {rms:.2f} |")
+    return text
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description="Figures of registration over unseen studies.")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--studies", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=3001)
+    parser.add_argument("--starts", type=int, default=2)
+    parser.add_argument("--surfaces", default="truth")
+    parser.add_argument("--peer", type=int, default=20)
+    parser.add_argument("--global", dest="without_start", type=int, default=0)
+    print(tables(work(parser.parse_args())))
+
+
+if __name__ == "__main__":
+    main()

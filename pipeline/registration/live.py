@@ -1,0 +1,205 @@
+"""Follow a registration while it is in use: one new tracked frame in, drift out.
+
+The pose is a state of six numbers that may creep; each frame measures it a little. An information
+filter adds up what the frames say: the state's information is that of the registration, less what
+the time since may have undone, plus the frame's own (as in A. H. Jazwinski, "Stochastic Processes
+and Filtering Theory", Academic Press 1970, chapter 7, with the frame's loss expanded to second
+order about the present pose in the place of a linear measurement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float, Float32, MovingSurface
+from pipeline.registration.frames import (
+    Lattice,
+    Samples,
+    TrackedSweep,
+    lattice_of,
+    sample_pictures,
+)
+from pipeline.registration.pose_search import Pivot
+from pipeline.registration.search import prepare_search
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.similarity import agreement
+from pipeline.registration.space import Registration
+from pipeline.registration.tissue_map import TissueMap
+from pipeline.registration.uncertainty import curvature_at, in_radians, sandwich
+
+# A step of one frame beyond this is no drift but an outlier; it is cut to this length.
+_LONGEST_STEP_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class LiveState:
+    """What is known at one moment."""
+
+    mr_from_tracker: Float
+    """4x4, the present estimate."""
+
+    covariance_mm2: Float
+    """``(6, 6)`` of its error, in square millimetres of `Pivot.move`."""
+
+    usual: float
+    """Running mean of the share of grey values that the model explains."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What one frame said."""
+
+    state: LiveState
+    """After the frame."""
+
+    shift_mm: float
+    """How far the heart's middle has moved since the registration."""
+
+    turn_deg: float
+    """How far it has turned."""
+
+    used: bool
+    """Whether the frame agreed with the model well enough to count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Follower:
+    """All that does not change from frame to frame."""
+
+    tissue: TissueMap
+    """The model, blurred as the frames are smoothed."""
+
+    pivot: Pivot
+    registered: Float
+    """4x4: the registration that is followed."""
+
+    information_of_loss: float
+    """How much information, per square millimetre, a unit of a frame's curvature is worth: below 1
+    where samples and neighbouring frames repeat one another."""
+
+    creep_mm: float = 0.1
+    """Standard deviation by which the pose may change from frame to frame, along each axis and
+    about each axis at the pivot's lever."""
+
+    def follow(
+        self,
+        state: LiveState,
+        lattice: Lattice,
+        image: Float32,
+        tracker_from_image: Float,
+        phase: float,
+    ) -> Drift:
+        """Refine the state by one frame.
+
+        Parameters
+        ----------
+        lattice
+            Of the sweep's geometry, from `pipeline.registration.frames.lattice_of`.
+        image
+            ``(h, w)`` grey values.
+        tracker_from_image
+            4x4: pixel ``(i, j, 0)`` to tracker millimetres.
+        phase
+            Of the frame, in [0, 1).
+
+        Raises
+        ------
+        InputError
+            When the phase is not in [0, 1).
+        """
+        if not 0 <= phase < 1:
+            raise InputError(f"a frame's phase must lie in [0, 1), got {phase!r}")
+        waited = state.covariance_mm2 + self.creep_mm**2 * np.eye(6)
+        usable = np.isfinite(tracker_from_image).all(keepdims=True)
+        samples = sample_pictures(
+            lattice, image[None], tracker_from_image[None], np.array([phase]), usable.ravel()
+        )
+        if samples.frames == 0:
+            return self._drift(replace(state, covariance_mm2=waited), used=False)
+        explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
+        used = explained > 0.5 * state.usual
+        if not used:
+            return self._drift(replace(state, covariance_mm2=waited), used=False)
+        usual = state.usual + 0.1 * (explained - state.usual)
+        step, covariance = self._update(samples, state.mr_from_tracker, waited)
+        pose = self.pivot.move(state.mr_from_tracker, step)
+        return self._drift(LiveState(pose, covariance, usual), used=True)
+
+    def _update(self, samples: Samples, pose: Float, prior_mm2: Float) -> tuple[Float, Float]:
+        """Step and covariance after one frame's loss, expanded about the present pose."""
+
+        def losses(step_mm: Float) -> Float:
+            moved = self.pivot.move(pose, step_mm)
+            return np.log1p(-agreement(samples, self.tissue, moved).explained)
+
+        curvature = curvature_at(losses)
+        values, vectors = np.linalg.eigh(curvature.bending)
+        # Where one frame's loss bends the wrong way it says nothing.
+        bending = (vectors * np.maximum(values, 0)) @ vectors.T
+        information = np.linalg.inv(prior_mm2) + self.information_of_loss * bending
+        covariance = np.linalg.inv(information)
+        step = -self.information_of_loss * covariance @ curvature.slopes[0]
+        length = float(np.linalg.norm(step))
+        return step * min(1.0, _LONGEST_STEP_MM / max(length, 1e-12)), covariance
+
+    def _drift(self, state: LiveState, used: bool) -> Drift:
+        shift_mm, turn_deg = self.pivot.distance(state.mr_from_tracker, self.registered)
+        return Drift(state, shift_mm, turn_deg, used)
+
+
+def prepare_follower(
+    sweeps: Sequence[TrackedSweep],
+    phases: Sequence[Float],
+    surfaces: Mapping[str, MovingSurface],
+    registered: Registration,
+    settings: RegisterSettings | None = None,
+) -> tuple[Follower, LiveState, list[Lattice]]:
+    """What is needed to follow a registration, from what it was made with.
+
+    Returns
+    -------
+    The follower, the state to begin with, and for each sweep the lattice for new frames of its
+    geometry.
+
+    Raises
+    ------
+    InputError
+        As in `pipeline.registration.space.register`.
+    """
+    settings = settings or RegisterSettings()
+    pose = registered.mr_from_tracker
+    search = prepare_search(phases, surfaces, pose, settings)
+    level = search.fine_level(sweeps)
+    good = np.flatnonzero(registered.valid[level.samples.number])
+    level = level.only(good).thinned(settings.max_frames)
+
+    def losses(step_mm: Float) -> Float:
+        moved = search.pivot.move(pose, step_mm)
+        return np.log1p(-agreement(level.samples, level.tissue, moved).explained)
+
+    curvature = curvature_at(losses)
+    ends = np.cumsum([len(sweep.images) for sweep in sweeps])
+    spread = sandwich(curvature, np.searchsorted(ends, level.samples.number, side="right"))
+    follower = Follower(search.fine, search.pivot, pose, information_of(spread, curvature.bending))
+    lattices = [
+        lattice_of(sweep, settings.sample_spacing_mm, settings.smoothing_mm) for sweep in sweeps
+    ]
+    usual = float(np.median(1 - registered.residual[registered.valid]))
+    scale = np.repeat([1.0, search.pivot.lever_mm], 3)
+    covariance_mm2 = registered.covariance * np.outer(scale, scale)
+    return follower, LiveState(pose, covariance_mm2, usual), lattices
+
+
+def information_of(covariance_mm2: Float, bending: Float) -> float:
+    """Information per unit of curvature: so much that all frames' curvature together, ``(6, 6)``,
+    is worth what the estimate's covariance says it was."""
+    return float(6 / np.trace(covariance_mm2 @ bending))
+
+
+def covariance_of(state: LiveState, pivot: Pivot) -> Float:
+    """``(6, 6)`` covariance of the state, mm and rad, as a registration gives it."""
+    return in_radians(state.covariance_mm2, pivot)

@@ -1,0 +1,155 @@
+"""The search for the pose of a whole study: where it begins, and from thick blur to thin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry import Float, Integer, MovingSurface
+from pipeline.registration.frames import Samples, TrackedSweep, choose, sample_frames
+from pipeline.registration.pose_search import (
+    Pivot,
+    climb,
+    climb_from_best,
+    pivot_of,
+    poses_anywhere,
+    poses_around,
+)
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.similarity import agreement
+from pipeline.registration.tissue_map import TissueMap, blurred, cavities_of, draw_tissue
+
+# The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
+_COARSE_BLUR_MM = 5.0
+_COARSE_SPACING_MM = 9.0
+_COARSE_FRAMES = 24
+# Optima of the rough level that are told apart at the fine one, and by how many frames.
+_RIVALS = 3
+_RIVAL_FRAMES = 16
+# Millimetres or degrees from the best pose at which another is another answer.
+_ELSEWHERE = 10.0
+# How much wider than around a start is looked without one.
+_WIDER_REACH, _MORE_STARTS = 2, 8
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Frames and model at one degree of blur."""
+
+    samples: Samples
+    tissue: TissueMap
+
+    def only(self, frames: Integer) -> Level:
+        """With these frames (rising) alone."""
+        return Level(choose(self.samples, frames), self.tissue)
+
+    def thinned(self, count: int) -> Level:
+        """With at most ``count`` of the frames, evenly spread."""
+        frames = self.samples.frames
+        if frames <= count:
+            return self
+        return self.only(np.linspace(0, frames - 1, count).round().astype(np.int64))
+
+    def score(self, mr_from_tracker: Float) -> float:
+        """Agreement of all frames at a pose."""
+        return agreement(self.samples, self.tissue, mr_from_tracker).score
+
+
+@dataclass(frozen=True, slots=True)
+class Best:
+    """What a search found."""
+
+    pose: Float
+    """4x4 ``mr_from_tracker``."""
+
+    score: float
+    """Agreement there."""
+
+    rival: float
+    """Agreement at the best optimum somewhere else; 0 where none was met."""
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Where to look, with what model, and how."""
+
+    start: Float | None
+    pivot: Pivot
+    coarse: TissueMap
+    fine: TissueMap
+    phases: Sequence[Float]
+    settings: RegisterSettings
+
+    def coarse_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
+        """Few frames, few samples, thick blur."""
+        samples = sample_frames(sweeps, self.phases, _COARSE_SPACING_MM, _COARSE_BLUR_MM)
+        return Level(samples, self.coarse).thinned(_COARSE_FRAMES)
+
+    def fine_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
+        """All frames as the settings ask for them."""
+        settings = self.settings
+        samples = sample_frames(
+            sweeps, self.phases, settings.sample_spacing_mm, settings.smoothing_mm
+        )
+        return Level(samples, self.fine)
+
+    def candidates(self, coarse: Level) -> list[Float]:
+        """The poses to begin from: around the start, or anywhere if there is none."""
+        settings = self.settings
+        if self.start is None:
+            return poses_anywhere(
+                coarse.samples.points_mm.astype(float),
+                self.pivot,
+                _WIDER_REACH * settings.capture_mm,
+                settings.candidates_anywhere,
+                settings.seed,
+            )
+        return poses_around(
+            self.start,
+            self.pivot,
+            settings.capture_mm,
+            settings.capture_deg,
+            settings.candidates,
+            settings.seed,
+        )
+
+    def best(self, sweeps: Sequence[TrackedSweep]) -> Best:
+        """The pose at which the frames agree best with the model."""
+        coarse = self.coarse_level(sweeps)
+        starts = self.settings.starts * (_MORE_STARTS if self.start is None else 1)
+        rivals = climb_from_best(
+            coarse.score, self.candidates(coarse), self.pivot, starts, kept=_RIVALS
+        )
+        fine = self.fine_level(sweeps)
+        few = fine.thinned(_RIVAL_FRAMES)
+        refined = [climb(few.score, rival, self.pivot, flatness=4e-3) for rival in rivals]
+        fine = fine.thinned(self.settings.max_frames)
+        pose = climb(fine.score, max(refined, key=fine.score), self.pivot)
+        elsewhere = [
+            fine.score(other)
+            for other in refined
+            if max(self.pivot.distance(other, pose)) > _ELSEWHERE
+        ]
+        return Best(pose, fine.score(pose), max(elsewhere, default=0.0))
+
+
+def prepare_search(
+    phases: Sequence[Float],
+    surfaces: Mapping[str, MovingSurface],
+    start: Float | None,
+    settings: RegisterSettings,
+) -> Search:
+    """Draw the model, rough and fine.
+
+    Raises
+    ------
+    InputError
+        When there is no cavity, or the surfaces have not the same phases.
+    """
+    tissue = draw_tissue(surfaces, settings.grid_mm)
+    pivot = pivot_of(cavities_of(surfaces))
+    coarse = blurred(tissue, _COARSE_BLUR_MM)
+    fine = blurred(tissue, settings.smoothing_mm)
+    return Search(start, pivot, coarse, fine, phases, settings)

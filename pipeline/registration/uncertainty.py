@@ -1,0 +1,151 @@
+"""How sure a rigid registration is: covariance of its six parameters, and what it does to a point.
+
+The pose minimises a sum of losses, one a frame. Where a model is only nearly right, the covariance
+of such an estimate is the sandwich ``A^-1 B A^-1``: A is the curvature of the sum, B the covariance
+of its slope (P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard
+conditions", Proc Fifth Berkeley Symp 1 (1967) 221-233). Neighbouring frames share speckle and
+anatomy, so their slopes are correlated: B counts neighbours with weights that fall linearly with
+the distance between them (W. K. Newey and K. D. West, "A simple, positive semi-definite,
+heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55 (1987)
+703-708). What all frames share, an error of the surfaces or of the probe's calibration, no spread
+between frames can show: it is added as a floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipeline.geometry import Float, Integer, transform_points
+from pipeline.registration.pose_search import Pivot
+
+FrameLosses = Callable[[Float], Float]
+"""``(frames,)`` losses, in nats or the like, after a step of six millimetres from the pose."""
+
+# Wide enough to look past the kinks that linear interpolation leaves at every node.
+_STEP_MM = 1.0
+# A loss flatter than this, of all frames together, per square millimetre leaves its direction
+# open: the standard deviation is then many centimetres.
+_FLATTEST = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Curvature:
+    """Slopes and bending of the frames' losses at a pose, per millimetre of `Pivot.move`."""
+
+    slopes: Float
+    """``(frames, 6)``: of each frame's loss."""
+
+    bending: Float
+    """``(6, 6)``: second derivatives of the sum over the frames."""
+
+
+def curvature_at(losses: FrameLosses) -> Curvature:
+    """Derivatives by central differences at step zero."""
+    steps = _STEP_MM * np.eye(6)
+    ahead = np.array([losses(step) for step in steps])
+    behind = np.array([losses(-step) for step in steps])
+    slopes = (ahead - behind).T / (2 * _STEP_MM)
+    here = losses(np.zeros(6)).sum()
+    bending = np.diag((ahead + behind).sum(axis=1) - 2 * here)
+    for i in range(6):
+        for j in range(i):
+            same = losses(steps[i] + steps[j]) + losses(-steps[i] - steps[j])
+            cross = losses(steps[i] - steps[j]) + losses(steps[j] - steps[i])
+            bending[i, j] = bending[j, i] = (same - cross).sum() / 4
+    return Curvature(slopes, bending / _STEP_MM**2)
+
+
+def sandwich(curvature: Curvature, sweep: Integer, reach: float = 0.25) -> Float:
+    """``(6, 6)`` covariance of the estimate, square millimetres of `Pivot.move`.
+
+    Parameters
+    ----------
+    curvature
+        At the estimate.
+    sweep
+        ``(frames,)`` number of the sweep that each frame, in order of time, belongs to: frames of
+        different sweeps are independent.
+    reach
+        Up to which share of a sweep's frames neighbours count as correlated.
+    """
+    frames = len(sweep)
+    slopes = curvature.slopes - curvature.slopes.mean(axis=0)
+    spread = np.zeros((6, 6))
+    for number in np.unique(sweep):
+        spread += _long_run(slopes[sweep == number], reach)
+    # Six parameters were fitted to these slopes: they are smaller than true errors would be.
+    spread *= frames / max(frames - 6, 1)
+    inverse = _inverse(curvature.bending)
+    covariance = inverse @ spread @ inverse
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def _long_run(slopes: Float, reach: float) -> Float:
+    """Covariance of the sum of a row of correlated slopes (Bartlett's weights)."""
+    total = slopes.T @ slopes
+    lags = min(len(slopes) - 1, max(1, round(reach * len(slopes))))
+    for lag in range(1, lags + 1):
+        shared = slopes[lag:].T @ slopes[:-lag]
+        total += (1 - lag / (lags + 1)) * (shared + shared.T)
+    return np.asarray(total)
+
+
+def _inverse(bending: Float) -> Float:
+    """Inverse of the curvature; a direction in which the loss does not rise stays open."""
+    values, vectors = np.linalg.eigh((bending + bending.T) / 2)
+    return np.asarray((vectors / np.maximum(values, _FLATTEST)) @ vectors.T)
+
+
+def in_radians(covariance_mm2: Float, pivot: Pivot) -> Float:
+    """Covariance of steps of `Pivot.move` as covariance of shift (mm) and rotation (rad)."""
+    scale = np.repeat([1.0, 1 / pivot.lever_mm], 3)
+    return np.asarray(covariance_mm2 * np.outer(scale, scale))
+
+
+def floor_of(error_mm: float, pivot: Pivot) -> Float:
+    """Covariance, mm and rad, of an error that all frames share: as large in shift along each
+    axis as in rotation about each axis at the pivot's lever."""
+    return in_radians(error_mm**2 * np.eye(6), pivot)
+
+
+def expected_tre_mm(covariance: Float, centre_mm: Float, points_mm: Float) -> Float:
+    """Root mean square target registration error that a covariance lets expect at points.
+
+    The covariance is carried to each point by the rigid motion's own derivative, as in J. M.
+    Fitzpatrick, J. B. West and C. R. Maurer, "Predicting error in rigid-body point-based
+    registration", IEEE Trans Med Imaging 17 (1998) 694-702, for any covariance.
+
+    Parameters
+    ----------
+    covariance
+        ``(6, 6)`` of shift (mm) and rotation vector (rad) about ``centre_mm``, in the MR frame.
+    centre_mm
+        ``(3,)`` LPS.
+    points_mm
+        ``(n, 3)`` LPS.
+
+    Returns
+    -------
+    ``(n,)`` mm.
+    """
+    arm = np.asarray(points_mm, float) - centre_mm
+    jacobian = np.zeros((len(arm), 3, 6))
+    jacobian[:, :, :3] = np.eye(3)
+    # d(omega x arm) / d omega is minus the cross-product matrix of the arm.
+    jacobian[:, 0, 4], jacobian[:, 0, 5] = arm[:, 2], -arm[:, 1]
+    jacobian[:, 1, 3], jacobian[:, 1, 5] = -arm[:, 2], arm[:, 0]
+    jacobian[:, 2, 3], jacobian[:, 2, 4] = arm[:, 1], -arm[:, 0]
+    variance = np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian)
+    return np.asarray(np.sqrt(np.maximum(variance, 0)))
+
+
+def motion_between(pose: Float, other: Float, centre_mm: Float) -> Float:
+    """``(6,)`` shift (mm) and rotation vector (rad) about ``centre_mm`` from ``other`` to
+    ``pose``: what a covariance is about."""
+    motion = pose @ np.linalg.inv(other)
+    shift = transform_points(motion, centre_mm) - centre_mm
+    return np.concatenate([shift, Rotation.from_matrix(motion[:3, :3]).as_rotvec()])

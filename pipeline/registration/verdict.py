@@ -1,0 +1,119 @@
+"""What a registration is worth: good, doubtful or failed, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.registration.settings import RegisterSettings
+
+Grade = Literal["good", "doubtful", "failed"]
+
+
+# Share of the best score that another pose may reach before the answer is in doubt, or open.
+_DOUBTFUL_RIVAL, _EQUAL_RIVAL = 0.75, 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks for and against a registration."""
+
+    confidence: float
+    """Score over the best that frames in the wrong place reach; 1 is chance."""
+
+    rival: float
+    """Share of the score that the best pose somewhere else reaches."""
+
+    expected_mm: float
+    """Root mean square of the expected error over the heart."""
+
+    valid: int
+    """Frames that bear the pose out."""
+
+    frames: int
+    """All frames."""
+
+    shift_mm: float
+    """From the start; 0 without one."""
+
+    turn_deg: float
+    """From the start; 0 without one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A grade, and the reasons against the next better one."""
+
+    grade: Grade
+    reason: str
+    """In words; empty for a good one."""
+
+
+def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
+    """The verdict on a registration.
+
+    It has failed where its frames agree hardly better than misplaced ones do, too few of them bear
+    it out, it ended outside the range that was searched, or its expected error is beyond use. It
+    is good where its expected error is small, most frames bear it out and none of that is near.
+    """
+    failures = _failures(evidence, settings)
+    if failures:
+        return Verdict("failed", "; ".join(failures))
+    doubts = _doubts(evidence, settings)
+    return Verdict("doubtful" if doubts else "good", "; ".join(doubts))
+
+
+def _failures(evidence: Evidence, settings: RegisterSettings) -> list[str]:
+    reasons = []
+    if evidence.confidence < settings.min_confidence:
+        reasons.append(
+            "registration found no pose to trust: frames agree with the model "
+            f"{evidence.confidence:.2f} times as well as frames in the wrong place do, needs "
+            f"{settings.min_confidence:g}; check the start, the phases (is the ECG of this "
+            "recording?), the transforms and the patient"
+        )
+    if evidence.rival > _EQUAL_RIVAL:
+        reasons.append(
+            f"two poses far apart agree alike with the frames ({evidence.rival:.0%}); give a first "
+            "guess, or record sweeps from another window"
+        )
+    # The candidates reach as far as the capture range; an optimum may lie a little beyond.
+    far = evidence.shift_mm > 1.5 * settings.capture_mm
+    if far or evidence.turn_deg > 1.5 * settings.capture_deg:
+        reasons.append(
+            f"registration ended {evidence.shift_mm:.1f} mm and {evidence.turn_deg:.1f} degrees "
+            f"from the start, far outside the {settings.capture_mm:g} mm and "
+            f"{settings.capture_deg:g} degrees that were searched; give a better start or widen "
+            "capture_mm and capture_deg"
+        )
+    if evidence.valid < settings.min_frames:
+        reasons.append(
+            f"only {evidence.valid} of {evidence.frames} frames bear the registration out, needs "
+            f"{settings.min_frames}; record sweeps that cross more of the heart"
+        )
+    if not evidence.expected_mm <= settings.worst_tre_mm:
+        reasons.append(
+            f"the frames leave the pose open: expected error {evidence.expected_mm:.1f} mm over "
+            f"the heart, at most {settings.worst_tre_mm:g} mm is of use; record sweeps from "
+            "another window or over more of the heart"
+        )
+    return reasons
+
+
+def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
+    reasons = []
+    if evidence.expected_mm > settings.good_tre_mm:
+        reasons.append(
+            f"expected error {evidence.expected_mm:.1f} mm over the heart, good is up to "
+            f"{settings.good_tre_mm:g} mm"
+        )
+    if evidence.confidence < 1.25 * settings.min_confidence:
+        reasons.append(
+            f"frames agree with the model only {evidence.confidence:.2f} times as well as frames "
+            "in the wrong place do"
+        )
+    if evidence.rival > _DOUBTFUL_RIVAL:
+        reasons.append(f"a pose far from this one agrees with the frames to {evidence.rival:.0%}")
+    if evidence.valid < 0.5 * evidence.frames:
+        reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
+    return reasons

@@ -1,0 +1,182 @@
+"""Covariance, expected error and verdict, against statistics and geometry worked out apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipeline.geometry import transform_points
+from pipeline.registration.pose_search import Pivot
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.uncertainty import (
+    curvature_at,
+    expected_tre_mm,
+    floor_of,
+    in_radians,
+    motion_between,
+    sandwich,
+)
+from pipeline.registration.verdict import Evidence, judge
+
+PIVOT = Pivot(np.array([10.0, -20.0, 30.0]), 40.0)
+BENDING = np.diag([2.0, 3.0, 1.0, 1.5, 0.5, 4.0]) + 0.2
+SOUND = {
+    "confidence": 4.0,
+    "rival": 0.4,
+    "expected_mm": 0.9,
+    "valid": 40,
+    "frames": 48,
+    "shift_mm": 9.0,
+    "turn_deg": 8.0,
+}
+
+
+def quadratic_losses(optima):
+    """Each frame's loss: half the squared distance from its own optimum, in BENDING's metric."""
+
+    def losses(step):
+        off = step - optima
+        return 0.5 * np.einsum("fi,ij,fj->f", off, BENDING, off)
+
+    return losses
+
+
+def test_derivatives_of_a_quadratic_are_exact():
+    """Central differences of second order are exact for polynomials of degree 2."""
+    optima = np.random.default_rng(0).normal(size=(9, 6))
+    found = curvature_at(quadratic_losses(optima))
+    np.testing.assert_allclose(found.bending, 9 * BENDING, rtol=1e-9)
+    np.testing.assert_allclose(found.slopes, -optima @ BENDING, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("persistence", [0.0, 0.6])
+def test_covariance_is_that_of_repeated_estimates(persistence):
+    """Frames' optima follow an autoregression; their mean, repeated, has a known spread.
+
+    The sum of 200 frames of lag-1 correlation r has (1 + r) / (1 - r) times the variance of
+    independent ones. With Bartlett's weights over 20 lags one estimate is short by r / (1 - r^2)
+    * 2 / 21 (9 % at r = 0.6) and by the removed mean's 21 / 200 = 10 %, and 200 / 194 too large:
+    at most 17 % short. The mean over 300 repeats and 6 parameters has a sampling error of
+    sqrt(4 / 3 * 20 / 200 / 1800) = 1 %.
+    """
+    rng = np.random.default_rng(1)
+    estimates = []
+    for _ in range(300):
+        noise = rng.normal(size=(200, 6))
+        optima = np.empty_like(noise)
+        optima[0] = noise[0]
+        for k in range(1, 200):
+            fresh = np.sqrt(1 - persistence**2) * noise[k]
+            optima[k] = persistence * optima[k - 1] + fresh
+        at = quadratic_losses(optima - optima.mean(axis=0))
+        estimates.append(np.diag(sandwich(curvature_at(at), np.zeros(200, int), reach=0.1)))
+    truth = (1 + persistence) / (1 - persistence) / 200
+    assert np.mean(estimates) == pytest.approx(truth, rel=0.2)
+
+
+def test_frames_of_different_sweeps_are_not_neighbours():
+    optima = np.repeat([[1.0] * 6, [-1.0] * 6], 8, axis=0)
+    at = curvature_at(quadratic_losses(optima))
+    together = sandwich(at, np.zeros(16, int))
+    apart = sandwich(at, np.repeat([0, 1], 8))
+    assert not np.allclose(together, apart)
+    np.testing.assert_allclose(sandwich(at, np.repeat([5, 9], 8)), apart)
+
+
+def test_a_direction_that_no_frame_fixes_is_left_open():
+    """Losses that do not change along x: the spread there is metres, elsewhere it is not."""
+    rng = np.random.default_rng(2)
+    optima = rng.normal(size=(30, 6))
+
+    def losses(step):
+        off = (step - optima)[:, 1:]
+        return 0.5 * (off**2).sum(axis=1) + 1e-3 * optima[:, 0] * step[0]
+
+    spread = np.sqrt(np.diag(sandwich(curvature_at(losses), np.zeros(30, int))))
+    assert spread[0] > 10
+    assert spread[1:].max() < 1
+
+
+@given(st.integers(0, 10_000))
+def test_expected_error_is_that_of_drawn_poses(seed):
+    """4000 poses drawn from a small covariance: the mean square differs by its own sampling.
+
+    The mean of 4000 squares of a normal 3-vector has a relative error under sqrt(2 / 4000) = 2.2 %,
+    its root half of that: 6 % is more than five of those. Rotations stay under 0.04 rad, where the
+    second order changes a displacement by 2 % at most.
+    """
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(6, 6)) * np.repeat([0.3, 0.004], 3)[:, None]
+    covariance = factor @ factor.T
+    point = PIVOT.centre_mm + rng.uniform(-60, 60, 3)
+    steps = rng.multivariate_normal(np.zeros(6), covariance, 4000)
+    moved = Rotation.from_rotvec(steps[:, 3:]).apply(point - PIVOT.centre_mm) + PIVOT.centre_mm
+    drawn = np.sqrt(((moved + steps[:, :3] - point) ** 2).sum(axis=1).mean())
+    expected = expected_tre_mm(covariance, PIVOT.centre_mm, point[None])[0]
+    assert expected == pytest.approx(drawn, rel=0.08)
+
+
+def test_floor_alone_gives_its_own_error_at_the_centre_and_at_the_lever():
+    """sqrt(3) e at the centre; one lever away two rotations add to it: sqrt(5) e."""
+    floor = floor_of(0.5, PIVOT)
+    points = PIVOT.centre_mm + np.array([[0, 0, 0], [PIVOT.lever_mm, 0, 0]])
+    expected = expected_tre_mm(floor, PIVOT.centre_mm, points)
+    np.testing.assert_allclose(expected, 0.5 * np.sqrt([3, 5]))
+
+
+def test_motion_between_poses_is_the_step_that_was_made():
+    step = np.array([1.0, -2.0, 0.5, 3.0, 1.0, -2.0])
+    pose = np.eye(4)
+    pose[:3, 3] = 5, 6, 7
+    motion = motion_between(PIVOT.move(pose, step), pose, PIVOT.centre_mm)
+    np.testing.assert_allclose(motion, step / np.repeat([1, PIVOT.lever_mm], 3), atol=1e-12)
+    there = transform_points(PIVOT.move(np.eye(4), step), PIVOT.centre_mm)
+    np.testing.assert_allclose(there - PIVOT.centre_mm, step[:3], atol=1e-12)
+
+
+def test_covariance_in_radians_is_divided_by_the_lever():
+    scaled = in_radians(np.eye(6), PIVOT)
+    np.testing.assert_allclose(np.diag(scaled), [1, 1, 1, *[1 / 1600] * 3])
+
+
+class TestVerdict:
+    def test_sound_evidence_is_good(self):
+        assert judge(Evidence(**SOUND), RegisterSettings()).grade == "good"
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            ({"expected_mm": 2.0}, "expected error 2.0 mm"),
+            ({"confidence": 1.7}, "1.70 times"),
+            ({"rival": 0.8}, "to 80%"),
+            ({"valid": 20}, "20 of 48"),
+        ],
+    )
+    def test_each_weakness_makes_it_doubtful_and_is_named(self, change, reason):
+        verdict = judge(Evidence(**(SOUND | change)), RegisterSettings())
+        assert verdict.grade == "doubtful"
+        assert reason in verdict.reason
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            ({"expected_mm": 9.0}, "leave the pose open"),
+            ({"expected_mm": float("nan")}, "leave the pose open"),
+            ({"confidence": 1.1}, "no pose to trust"),
+            ({"rival": 0.95}, "two poses far apart"),
+            ({"valid": 3}, "only 3 of 48"),
+            ({"shift_mm": 31.0}, "31.0 mm"),
+            ({"turn_deg": 31.0}, "31.0 degrees"),
+        ],
+    )
+    def test_each_fault_fails_it_and_is_named(self, change, reason):
+        verdict = judge(Evidence(**(SOUND | change)), RegisterSettings())
+        assert verdict.grade == "failed"
+        assert reason in verdict.reason
+
+    def test_settings_refuse_bounds_that_cross(self):
+        with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):
+            RegisterSettings(good_tre_mm=3, worst_tre_mm=2)

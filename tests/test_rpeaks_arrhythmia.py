@@ -1,0 +1,48 @@
+"""The detector on what R-peak detectors fail on: rhythms, shapes and faults of Holter records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arrhythmia_records import CASES, matched, record
+
+from pipeline.registration.rpeaks import find_beats
+
+# Cases that a detector without a memory of shapes cannot be asked to solve: an atrial wave as high
+# as some beats, an early beat of the energy of such a wave, and noise as strong as the beats.
+HARD = {"blocked", "small ventricular premature"}
+
+
+@pytest.mark.parametrize("case", sorted(set(CASES) - HARD))
+def test_beats_of_two_leads_are_found_and_nothing_else(case):
+    drawn = record(case, seed=7, duration_s=60.0)
+    found_s = np.array([beat.time_s for beat in find_beats(drawn.signal_mv, drawn.rate_hz)])
+
+    pairs = matched(found_s, drawn.r_times_s)
+
+    # A record may begin or end within a beat, and a change of gain may cost one.
+    missed, extra = (pairs < 0).sum(), len(found_s) - (pairs >= 0).sum()
+    assert missed <= 2
+    assert extra <= 2
+
+
+@pytest.mark.parametrize("case", sorted(HARD))
+def test_hard_cases_lose_few_beats(case):
+    drawn = record(case, seed=7, duration_s=60.0)
+    found_s = np.array([beat.time_s for beat in find_beats(drawn.signal_mv, drawn.rate_hz)])
+    pairs = matched(found_s, drawn.r_times_s)
+    # Whatever is confused, four beats in five are the heart's own.
+    assert (pairs >= 0).mean() > 0.8
+    assert (pairs >= 0).sum() > 0.8 * len(found_s)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_slow_heart_is_learnt_even_if_its_first_beat_comes_late(seed):
+    # The first beat comes a whole interval after the start, in the third second.
+    drawn = record("slow", seed, duration_s=40.0)
+    assert drawn.r_times_s[0] > 1.5
+    found_s = np.array([beat.time_s for beat in find_beats(drawn.signal_mv, drawn.rate_hz)])
+    pairs = matched(found_s, drawn.r_times_s)
+    assert (pairs >= 0).all()
+    # A beat that the end cuts may be found or not.
+    assert len(found_s) <= len(drawn.r_times_s) + 1
