@@ -17,7 +17,7 @@ SEED ?= 1
 
 STAGES := ingest segment surface register bake evaluate report
 
-.PHONY: help setup demo test check lint types bench train batch clean $(STAGES)
+.PHONY: help setup demo paper test check lint types bench train batch clean $(STAGES)
 
 help: ## explain every target
 	@sed -n 's/^\([a-z][a-z |]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{printf "%-10s %s\n", $$1, $$2}'
@@ -38,6 +38,10 @@ demo: $(STUDY)/study.yaml ## a synthetic patient becomes a force field, with a r
 
 demo/studies-$(SEED)/patient-0001/study.yaml: $(READY)
 	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite
+
+paper: $(READY) ## the paper's figures and table, re-run from the demo's field: paper/index.html
+	test -d $(OUT)/patient-0001/bake/field.zarr || $(MAKE) demo
+	$(BIN)/beatfield paper paper --products $(OUT)/patient-0001 --study $(STUDY)
 
 test: setup ## run all tests
 	$(BIN)/pytest -n 2 --dist worksteal -q
@@ -70,5 +74,5 @@ batch: setup ## run a folder of studies: make batch STUDIES=... OUT=... WORKERS=
 	$(BIN)/beatfield batch $(STUDIES) --out $(OUT) --workers $(WORKERS) --config $(CONFIG)
 
 clean: ## remove the demo, caches and the virtual environment
-	rm -rf demo training $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf demo paper training $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

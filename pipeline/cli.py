@@ -18,6 +18,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from pipeline import __version__
 from pipeline.errors import BeatfieldError, InputError
+from pipeline.paper.options import PAPER, PaperOptions
 
 HELP = "From a patient's cine MR to a force field that a haptic robot can feel."
 
@@ -358,6 +359,15 @@ def synth(
     """
     # A process of its own: the pipeline does not know the code that makes its test data.
     return subprocess.call([sys.executable, "-m", "data_synth", *arguments])
+
+
+@app.command
+def paper(out: Path, /, options: Annotated[PaperOptions, Parameter(name="*")] = PAPER) -> int:
+    """Repeat the paper's figures and table from a baked field: OUT/index.html and its figures."""
+    from pipeline.paper.write import write_paper
+
+    print(f"page      {write_paper(out, options, Console())}")
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

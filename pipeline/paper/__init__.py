@@ -1,0 +1,1 @@
+"""The paper's own experiments, repeated from a baked field: figures, table and one page."""
