@@ -193,12 +193,16 @@ def _registration(job: Job, truth: Path, known: dict[str, Any]) -> dict[str, Any
 
 
 def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
-    """Cyclic phase error of every frame, matched to truth by its time stamp."""
+    """Cyclic phase error of every frame, matched to truth by its time stamp.
+
+    Truth is where in the cycle of the MR's mean beat the heart was, as the frames' phases are.
+    """
     errors = []
     for row in read_frames(job.products / "register" / "frames.csv"):
         sweep = known["us_frames"][row.sweep]
         nearest = int(np.abs(np.array(sweep["times_s"]) - row.time_s).argmin())
-        errors.append(phase_error(np.array(row.phase), np.array(sweep["phases"][nearest])))
+        true = sweep["mechanical_phases"][nearest]
+        errors.append(phase_error(np.array(row.phase), np.array(true)))
     return np.array(errors)
 
 
