@@ -257,7 +257,12 @@ def _table(rows: list[Row], found: Float) -> Table:
 
 def _paper_table(rows: list[Row], found: Float) -> Table:
     """The paper's four mean times beside ours with the same heart."""
-    head = ["mean time", "no force", "with force", "ratio"]
+    head = [
+        "mean time",
+        "no force",
+        "with force",
+        "ratio (paper: of the means; here: mean of each operator's own)",
+    ]
     lines = [
         (f"paper, {place} pair", clock(free), clock(forced), f"{forced / free:.2f}")
         for place, (free, forced) in zip(("first", "second"), PAPER_S, strict=True)

@@ -7,7 +7,8 @@
  *
  * and everywhere else just the #include. No library is needed but libm; nothing is allocated.
  *
- *     bf_clock clock = bf_new_clock(field.rr_s, 10.0 / field.fixture[0].f_max_n);  10 N/s at most
+ *     bf_clock clock = bf_new_clock(rr_s, 10.0 / field.fixture[0].f_max_n);  10 N/s at most
+ *     (rr_s: field.rr_s, or what a beat lasts usually where that is 0, unknown)
  *     bf_beat(&clock, r_s, 0);                       whenever an R peak becomes known
  *     bf_tick now;
  *     bf_now(&clock, time_s, lead_connected, &now);  in every turn of the loop
