@@ -14,13 +14,18 @@ from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness, volumes_ml
 from pipeline.geometry import Float, Label, MovingSurface, transform_points
 from pipeline.imaging.labels import LABELS
-from pipeline.surface.extraction import STRUCTURES, extract_moving_surfaces
+from pipeline.surface.extraction import STRUCTURES, extract
 from pipeline.surface.settings import SurfaceSettings
 
 PHASES = np.array([0.0, 0.15, 0.35, 0.5, 0.7, 0.85])
 LV = MovingBody(ellipsoid((15, 15, 27)), strain=(0.25, 0.25, 0.1), shift_mm=(0, 0, 4))
 MUSCLE = MovingBody(ellipsoid((22, 22, 34)), strain=(0.1, 0.1, 0.1), shift_mm=(0, 0, 4))
 SETTINGS = SurfaceSettings(edge_mm=2.5)
+
+
+def surfaces_of(*arguments) -> dict[str, MovingSurface]:
+    """Surfaces alone, without what had to be mended."""
+    return extract(*arguments).surfaces
 
 
 def placed(body: MovingBody, centre: tuple[float, float, float], points: Float, phase: float):
@@ -52,7 +57,7 @@ HEART, FRAME = heart_labels()
 
 @pytest.fixture(scope="module")
 def surfaces() -> dict[str, MovingSurface]:
-    return extract_moving_surfaces(HEART, FRAME, PHASES, SETTINGS)
+    return surfaces_of(HEART, FRAME, PHASES, SETTINGS)
 
 
 def test_every_structure_that_is_there_gets_a_surface_and_no_other(surfaces):
@@ -111,7 +116,7 @@ def balls(gap_mm: float) -> tuple[Label, Float]:
 def test_the_heart_bridges_a_gap_that_opens_in_one_phase():
     """Two faces 4 mm apart are 2 mm from the middle: 8 mm fill 1.4 mm, twice as many 2.8 mm."""
     heart, frame = balls(4.0)
-    found = extract_moving_surfaces(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+    found = surfaces_of(heart, frame, np.array([0.0, 0.5]), SETTINGS)
     low, high = found["heart"].vertices_mm[1].min(axis=0), found["heart"].vertices_mm[1].max(axis=0)
     assert high[0] - low[0] == pytest.approx(2 * 16 + 2 * 14 + 4, abs=SPACING_MM)
     assert closedness(found["heart"].at(1)).is_solid
@@ -120,7 +125,7 @@ def test_the_heart_bridges_a_gap_that_opens_in_one_phase():
 def test_a_heart_in_pieces_is_refused():
     heart, frame = balls(15.0)
     with pytest.raises(StageError, match=r"heart: .*pieces in phase 1 "):
-        extract_moving_surfaces(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+        surfaces_of(heart, frame, np.array([0.0, 0.5]), SETTINGS)
 
 
 def one_ventricle(phases: int = 2) -> Label:
@@ -153,9 +158,9 @@ def test_surfaces_move_with_the_frame_of_the_grid(turn, place, mirrored, spacing
     scaled = SurfaceSettings(edge_mm=2 * spacing_mm, heart_blend_mm=5 * spacing_mm)
     unit = SurfaceSettings(edge_mm=2.0, heart_blend_mm=5.0)
 
-    found = extract_moving_surfaces(VENTRICLE, frame, phases, scaled)
+    found = surfaces_of(VENTRICLE, frame, phases, scaled)
 
-    plain = extract_moving_surfaces(VENTRICLE, np.eye(4), phases, unit)
+    plain = surfaces_of(VENTRICLE, np.eye(4), phases, unit)
     for name, moving in found.items():
         expected = transform_points(frame, plain[name].vertices_mm)
         # Distances are kept in 32 bits, and settings in mm round: 1e-3 voxels.
@@ -166,7 +171,7 @@ def test_surfaces_move_with_the_frame_of_the_grid(turn, place, mirrored, spacing
 def test_a_body_that_touches_the_border_of_the_grid_is_closed():
     """A ball's half at the border: the flat side closes it, with the volume of the voxels."""
     cut = VENTRICLE[:, 17:]
-    found = extract_moving_surfaces(cut, FRAME, np.array([0.0, 0.5]), SETTINGS)["epicardium"]
+    found = surfaces_of(cut, FRAME, np.array([0.0, 0.5]), SETTINGS)["epicardium"]
     assert closedness(found.at(0)).is_solid
     voxels_ml = np.count_nonzero(cut[0]) * SPACING_MM**3 / 1000
     assert volumes_ml(found)[0] == pytest.approx(voxels_ml, rel=5e-3)
@@ -174,21 +179,19 @@ def test_a_body_that_touches_the_border_of_the_grid_is_closed():
 
 def test_the_same_labels_give_the_same_bytes():
     phases = np.array([0.0, 0.5])
-    runs = [extract_moving_surfaces(VENTRICLE, FRAME, phases, SETTINGS) for _ in range(2)]
+    runs = [surfaces_of(VENTRICLE, FRAME, phases, SETTINGS) for _ in range(2)]
     for name in runs[0]:
         assert runs[0][name].vertices_mm.tobytes() == runs[1][name].vertices_mm.tobytes()
 
 
 def test_one_phase_is_enough():
-    found = extract_moving_surfaces(VENTRICLE[:1], FRAME, np.array([0.4]), SETTINGS)
+    found = surfaces_of(VENTRICLE[:1], FRAME, np.array([0.4]), SETTINGS)
     assert found["lv_endocardium"].vertices_mm.shape[0] == 1
 
 
 def test_progress_is_told_for_each_structure():
     calls: list[tuple[int, int]] = []
-    extract_moving_surfaces(
-        VENTRICLE, FRAME, np.array([0.0, 0.5]), SETTINGS, lambda *call: calls.append(call)
-    )
+    surfaces_of(VENTRICLE, FRAME, np.array([0.0, 0.5]), SETTINGS, lambda *call: calls.append(call))
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -196,21 +199,21 @@ def test_progress_is_told_for_each_structure():
 def test_a_heart_without_left_ventricle_is_refused(label):
     without = np.where(LABELS[label] == VENTRICLE, np.uint8(0), VENTRICLE)
     with pytest.raises(StageError, match=f"no {label} in any phase"):
-        extract_moving_surfaces(without, FRAME, np.array([0.0, 0.5]), SETTINGS)
+        surfaces_of(without, FRAME, np.array([0.0, 0.5]), SETTINGS)
 
 
 def test_a_structure_lost_in_one_phase_is_named_with_the_phase():
     broken = HEART.copy()
     broken[3][broken[3] == LABELS["right_atrium"]] = 0
     with pytest.raises(StageError, match=r"right_atrium: phase 3 \(at 0\.500 of the beat\) has 0"):
-        extract_moving_surfaces(broken, FRAME, PHASES, SETTINGS)
+        surfaces_of(broken, FRAME, PHASES, SETTINGS)
 
 
 def test_specks_of_a_structure_are_no_structure():
     """A few voxels of aorta in all phases are left out rather than made a surface of."""
     specked = VENTRICLE.copy()
     specked[:, 1:3, 1:3, 1:3] = LABELS["aorta"]
-    found = extract_moving_surfaces(specked, FRAME, np.array([0.0, 0.5]), SETTINGS)
+    found = surfaces_of(specked, FRAME, np.array([0.0, 0.5]), SETTINGS)
     assert "aorta" not in found
 
 
@@ -234,7 +237,7 @@ FLAT = np.diag([1.5, 1.5, 8.0, 1.0])
 )
 def test_input_that_does_not_fit_is_refused(heart, frame, phases, words):
     with pytest.raises(InputError, match=words):
-        extract_moving_surfaces(heart, frame, np.array(phases), SETTINGS)
+        surfaces_of(heart, frame, np.array(phases), SETTINGS)
 
 
 @pytest.mark.parametrize("bad", [{"edge": 2}, {"edge_mm": 0}, {"reference_phase": 1.0}])

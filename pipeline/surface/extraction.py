@@ -100,17 +100,6 @@ class Extraction:
     """How many triangles of each, over all phases, still pass through others; 0 as it should be."""
 
 
-def extract_moving_surfaces(
-    heart: Label,
-    mr_from_index: Float,
-    phases: Float,
-    settings: SurfaceSettings,
-    progress: Progress | None = None,
-) -> dict[str, MovingSurface]:
-    """Surfaces alone; see ``extract``."""
-    return extract(heart, mr_from_index, phases, settings, progress).surfaces
-
-
 def extract(
     heart: Label,
     mr_from_index: Float,
