@@ -14,6 +14,7 @@ from numba import njit
 
 from pipeline.evaluation import dissection_forces, rod
 from pipeline.evaluation.dissection_values import MINDS, SUMS, Mind, Sum
+from pipeline.evaluation.operators import EFFECTIVE_WIDTH
 from pipeline.field import kernels
 
 ASKED, INNER = kernels.ASKED, kernels.INNER
@@ -61,7 +62,7 @@ def _look(task, person, mind, draws, plan, tip, phase, time, aim):  # type: igno
     """
     pellet_at(task, int(mind[Mind.PELLET]), phase, aim)
     first = int(mind[Mind.DRAWN])
-    scatter = task.width_mm / 4.133
+    scatter = task.width_mm / EFFECTIVE_WIDTH
     depth = person.depth_bias_mm + person.depth_sd_mm * draws[first % len(draws)]
     mind[Mind.DRAWN] += 4
     meant_x, meant_y, meant_z = _across(plan[0] + plan[1], task.pivot_mm, task.rod_mm)
