@@ -101,9 +101,7 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
     stack, places, walk = room[:, :7], room[:, 7:11], room[-1]
     left, right = room[-2], room[-3]
     walk[0], walk[1], walk[2] = 0.0, 0.0, 0.0
-    total = 0.0
-    for piece in range(len(line_mm) - 1):
-        total += _piece_length(line_mm, piece)
+    total = _length(line_mm)
     if len(line_mm) > 1:
         walk[2] = _piece_length(line_mm, 0)
     longest = 2.0 * min(grid[3], grid[4], grid[5])
@@ -142,15 +140,32 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
                 _add(found, here, -share / 3, pose, handle_mm)
                 top -= 1
                 continue
-            # Whole rows at once would take a second longer to compile.
-            for n in range(7):
-                stack[top, n], stack[top + 1, n] = right[n], left[n]
-            places[top, 0], places[top, 1] = middle + way / 2, way
-            places[top, 2], places[top, 3] = share / 2, depth + 1
-            places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way
-            places[top + 1, 2], places[top + 1, 3] = share / 2, depth + 1
+            _halve(stack, places, top, left, right)
             top += 1
     return total, asked
+
+
+@njit(**INNER)
+def _length(line_mm):  # type: ignore[no-untyped-def]
+    """Length of a whole line."""
+    total = 0.0
+    for piece in range(len(line_mm) - 1):
+        total += _piece_length(line_mm, piece)
+    return total
+
+
+@njit(**INNER)
+def _halve(stack, places, top, left, right):  # type: ignore[no-untyped-def]
+    """Put the two halves of the topmost segment in its place, the left one on top."""
+    # Whole rows at once would take a second longer to compile.
+    for n in range(7):
+        stack[top, n], stack[top + 1, n] = right[n], left[n]
+    middle, way, share = places[top, 0], 0.5 * places[top, 1], 0.5 * places[top, 2]
+    depth = places[top, 3] + 1
+    places[top, 0], places[top, 1] = middle + way / 2, way
+    places[top, 2], places[top, 3] = share, depth
+    places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way
+    places[top + 1, 2], places[top + 1, 3] = share, depth
 
 
 @njit(**ASKED)
