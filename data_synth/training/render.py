@@ -15,12 +15,12 @@ import numpy.typing as npt
 from data_synth.tissue import Tissue
 from data_synth.training.contrast import (
     IN_HEART,
-    IS_BLOOD,
     LABEL_OF,
     USUAL_CONTRAST,
     Contrast,
     draw_contrast,
 )
+from data_synth.training.decor import Decor
 from data_synth.training.faults import smooth_noise, spoil, spoil_little
 
 Float = npt.NDArray[np.floating]
@@ -278,7 +278,7 @@ def _thick_slices(
     weights = (weights / weights.sum()).astype(np.float32)
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
-    decor = _Decor(rng, side, parts.rims, fat) if parts.detail else None
+    decor = Decor(rng, side, parts.rims, fat) if parts.detail else None
     mean = contrast.mean.copy()
     if rng.random() < 0.5:
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
@@ -303,125 +303,3 @@ def _drop_neighbours(rng: np.random.Generator, image: Float32, end: int) -> None
         image[0] = image[1]
     if rng.random() < (chance if end >= 0 else 0.05):
         image[2] = image[1]
-
-
-class _Decor:
-    """Detail that the tissue block lacks, the same through the three slices of an image.
-
-    Trabeculae and papillary muscles lie inside the cavities' labels: the contour to learn is the
-    smooth one that a reader draws.
-    """
-
-    def __init__(self, rng: np.random.Generator, side: int, rims: bool, fat: bool) -> None:
-        self.fine = smooth_noise(rng, side, side // int(rng.integers(3, 9)))
-        self.coarse = [smooth_noise(rng, side, int(rng.integers(4, 20))) for _ in range(3)]
-        self.organ = rng.uniform(0.0, 1.4, 3)
-        self.organ_level = rng.uniform(0.5, 2.5, 3)
-        self.organs = int(rng.integers(0, 4))
-        self.fat_px = rng.uniform(-6.0, 8.0) if fat else 0.0
-        # Mostly fat; an effusion, an organ or lung may lie against the heart as well.
-        self.fat = rng.uniform(0.3, 1.6) if rng.random() < 0.75 else rng.uniform(0.0, 1.2)
-        self.tubes = rng.uniform(0.0, 1.0, (int(rng.integers(0, 5)), 5))
-        self.strands = {
-            Tissue.LV_CAVITY: _Strands.draw(rng, 6.0),
-            Tissue.RV_CAVITY: _Strands.draw(rng, 12.0),
-        }
-        self.papillaries = _draw_papillaries(rng)
-        self.edge_px = rng.uniform(0.4, 1.0)
-        self.flow = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else 0.0
-        self.rims = rng.uniform(0.0, 0.5, 2) * (rng.random(2) < 0.5) if rims else np.zeros(2)
-        self.rim_px = rng.uniform(0.8, 1.6, 2) if rims else np.ones(2)
-
-    def paint(self, image: Float32, tissue: Label, contrast: Contrast) -> None:
-        """Add the detail to one slice in place; ``tissue`` is that of its middle plane."""
-        inside = IN_HEART[tissue]
-        outside = ~inside & (tissue != Tissue.AIR)
-        for number in range(self.organs):
-            blob = outside & (self.coarse[number] > self.organ_level[number])
-            image[blob] = 0.3 * image[blob] + 0.7 * self.organ[number]
-        if self.fat_px > 0 and inside.any():
-            away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
-            reach_px = self.fat_px + 3 * self.coarse[0]
-            image[outside & (away < reach_px)] = self.fat
-            # The pericardium around the fat, and the black line where fat meets muscle.
-            around = (away >= reach_px, away < reach_px + self.rim_px[0])
-            self._darken(image, outside & around[0] & around[1], self.rims[0])
-            self._darken(image, outside & (away < self.rim_px[1]), self.rims[1])
-        self._add_tubes(image, outside, contrast)
-        blood = IS_BLOOD[tissue]
-        image[blood] *= (1 + self.flow * self.coarse[1])[blood]
-        muscle = np.zeros_like(image)
-        for chamber, strands in self.strands.items():
-            strands.paint(muscle, tissue == chamber, self.fine, self.coarse[2])
-        _paint_papillaries(muscle, tissue == Tissue.LV_CAVITY, self.papillaries)
-        if muscle.any():
-            muscle = cv2.GaussianBlur(muscle, (0, 0), self.edge_px)
-            image += np.where(blood, muscle, 0) * (contrast.muscle - image)
-
-    def _darken(self, image: Float32, where: Mask, grey: float) -> None:
-        if grey > 0:
-            image[where] = np.minimum(image[where], grey)
-
-    def _add_tubes(self, image: Float32, outside: Mask, contrast: Contrast) -> None:
-        """Bright ovals with a dark rim: vessels and bowels that belong to no structure."""
-        side = image.shape[0]
-        for row, column, size, shape, grey in self.tubes:
-            centre = (column * side, row * side)
-            axes = ((2 + 12 * size) * 2, (2 + 12 * size) * (0.8 + shape))
-            for grown, value in ((3.0, contrast.muscle * 0.8), (0.0, 0.5 + 0.7 * grey)):
-                oval = np.zeros(image.shape, np.uint8)
-                box = (centre, (axes[0] + grown, axes[1] + grown), 180 * grey)
-                cv2.ellipse(oval, box, 1, cv2.FILLED)
-                image[(oval > 0) & outside] = value
-
-
-@dataclass(frozen=True, slots=True)
-class _Strands:
-    """Trabeculae along a chamber's wall."""
-
-    depth_px: float
-    """How far they reach into the cavity; 0 where there are none."""
-
-    level: float
-    """Of a smooth noise of unit variance, above which muscle stands; rises with depth."""
-
-    share: float
-    """Of muscle in a pixel."""
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator, deepest_px: float) -> _Strands:
-        """Draw them for one chamber; three in four have some, a few are nearly filled."""
-        depth_px = rng.uniform(0.5, deepest_px) if rng.random() < 0.75 else 0.0
-        if rng.random() < 0.05:
-            depth_px = 2 * deepest_px
-        return cls(depth_px, rng.uniform(-0.7, 1.2), rng.uniform(0.2, 1.0))
-
-    def paint(self, muscle: Float32, cavity: Mask, fine: Float32, coarse: Float32) -> None:
-        """Raise the share of muscle in place where strands stand in ``cavity``."""
-        if self.depth_px == 0 or not cavity.any():
-            return
-        depth = cv2.distanceTransform(cavity.astype(np.uint8), cv2.DIST_L2, 3)
-        limit = min(self.depth_px, 0.6 * float(depth.max())) * (1 + 0.5 * coarse)
-        above = self.level + 0.5 * (depth / np.maximum(limit, 0.3) - 0.5)
-        muscle[cavity & (depth < limit) & (fine > above)] = self.share
-
-
-def _draw_papillaries(rng: np.random.Generator) -> Float:
-    """Papillary muscles ``(n, 5)``: angle, depth, length, width (shares of radius), turn."""
-    count = int(rng.integers(1, 5)) if rng.random() < 0.65 else 0
-    low, high = (0.0, 0.35, 0.12, 0.06, -0.6), (2 * np.pi, 1.0, 0.4, 0.26, 0.6)
-    return rng.uniform(low, high, (count, 5))
-
-
-def _paint_papillaries(muscle: Float32, cavity: Mask, papillaries: Float) -> None:
-    """Fill ovals that point to the middle of the cavity with muscle, in place."""
-    if not len(papillaries) or not cavity.any():
-        return
-    where = np.argwhere(cavity)
-    centre, radius = where.mean(axis=0), np.sqrt(len(where) / np.pi)
-    for angle, depth, length, width, turn in papillaries:
-        row, column = centre + depth * radius * np.array([np.sin(angle), np.cos(angle)])
-        oval = np.zeros(muscle.shape, np.uint8)
-        box = ((column, row), (2 * length * radius, 2 * width * radius), np.degrees(angle + turn))
-        cv2.ellipse(oval, box, 1, cv2.FILLED)
-        muscle[(oval > 0) & cavity] = 1.0
