@@ -15,7 +15,7 @@ from data_synth.heart import BeatingHeart
 from data_synth.meshes import body_volumes_ml, mesh_volume_ml, reference_meshes
 from data_synth.population import draw_heart
 from data_synth.thorax import Thorax, chest_points
-from data_synth.tissue import TRUTH_LABELS, Tissue, truth_values
+from data_synth.tissue import Tissue, truth_values
 
 NAMES = {
     "lv_endocardium",
@@ -396,8 +396,3 @@ def test_vertebrae_and_discs_take_turns():
 def test_points_of_the_wrong_shape_are_refused(heart):
     with pytest.raises(SynthError, match=r"\(n, 3\)"):
         heart.tissue(np.zeros(3), 0.0)
-
-
-def test_truth_labels_are_distinct():
-    values = [value for value, _ in TRUTH_LABELS.values()]
-    assert sorted(values) == list(range(1, 7))

@@ -332,3 +332,8 @@ def test_every_setting_and_every_entry_of_the_truth_is_documented(truth):
     )
     named |= set(truth["chambers"]["left_ventricle"])
     assert not {key for key in named if f"`{key}`" not in page}
+
+
+def test_truth_labels_are_distinct():
+    values = [value for value, _ in TRUTH_LABELS.values()]
+    assert sorted(values) == list(range(1, 7))
