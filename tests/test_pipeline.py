@@ -20,6 +20,7 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from pipeline.field import ForceField
+from pipeline.geometry import Float
 
 PHASES = 8
 
@@ -103,6 +104,25 @@ def test_registration_ends_within_three_millimetres_from_ten_off(products: Path)
     assert metrics["frame_phase_error"]["largest"] < 0.05
 
 
+def at_stored_phase(store: Path, structure: str, phase: int, shape: tuple[int, ...]) -> Float:
+    """Coefficients ``(z, y, x)`` at a stored phase: 1/8, 6/8 and 1/8 of three phases'."""
+    chunks = store / "spline" / structure / "c"
+    each = [
+        np.memmap(chunks / str(phase + step) / "0/0/0", "<f4", "r", shape=shape[1:])
+        for step in (-1, 0, 1)
+    ]
+    return np.asarray(np.tensordot(np.array([1, 6, 1]) / 8, np.asarray(each, dtype=float), 1))
+
+
+def at_nodes(coefficients: Float, along: int | None = None) -> Float:
+    """A quadratic spline at its nodes, or its slope a node along one axis."""
+    values = coefficients
+    for axis in range(3):
+        weights = [-0.5, 0, 0.5] if axis == along else [1 / 8, 6 / 8, 1 / 8]
+        values = correlate1d(values, weights, axis=axis)
+    return np.asarray(values)
+
+
 def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path) -> None:
     store = products / "bake" / "field.zarr"
     field = ForceField.open(store)
@@ -118,17 +138,8 @@ def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path
     index = np.stack([rng.integers(1, size - 1, 200) for size in shape[1:]], axis=1)
     points_mm = field.grid.nodes_mm()[tuple(index.T)]
     at = described["phases"][phase]
-    # At a node and stored phase of a quadratic spline: 1/8, 6/8, 1/8 of the coefficients, and half
-    # the difference of the neighbours along the axis of the derivative.
-    spline = store / "spline" / fixture["structure"] / "c"
-    mean, half = np.array([1, 6, 1]) / 8, np.array([-0.5, 0, 0.5])
-    coefficients = sum(
-        weight * np.memmap(spline / str(phase + step) / "0/0/0", "<f4", "r", shape=shape[1:])
-        for step, weight in zip((-1, 0, 1), mean, strict=True)
-    )
-    values = np.asarray(coefficients, dtype=float)
-    for axis in range(3):
-        values = correlate1d(values, mean, axis=axis)
+    coefficients = at_stored_phase(store, fixture["structure"], phase, shape)
+    values = at_nodes(coefficients)
     distance_mm = values[tuple(index.T)]
     np.testing.assert_allclose(field.distance_mm(points_mm, at), distance_mm, atol=1e-4)
     corrected_mm = described["structures"][fixture["structure"]]["correction_mm"]
@@ -139,12 +150,10 @@ def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path
     delta, m, f_max_n = fixture["delta_mm"], fixture["m"], fixture["f_max_n"]
     expected = 1 - np.exp(-((distance_mm**2 / (2 * delta**2)) ** m))
     np.testing.assert_allclose(field.potential(points_mm, at, fixture=name), expected, atol=1e-5)
-    slopes = []
-    for axis in (2, 1, 0):
-        values = np.asarray(coefficients, dtype=float)
-        for other in range(3):
-            values = correlate1d(values, half if other == axis else mean, axis=other)
-        slopes.append(values[tuple(index.T)] / field.grid.spacing_mm[2 - axis])
+    slopes = [
+        at_nodes(coefficients, along=axis)[tuple(index.T)] / field.grid.spacing_mm[2 - axis]
+        for axis in (2, 1, 0)
+    ]
     gradient = np.stack(slopes, axis=-1)
     length = np.linalg.norm(gradient, axis=1)
     clear = length > 0.6  # off the medial axis, where the direction is defined
