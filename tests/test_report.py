@@ -20,7 +20,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.report import curves, heart, slices
 from pipeline.report.animation import HEAD, ROOM, TOWARDS_VIEWER, even_in_time, framing
 from pipeline.report.moments import MARGIN_PIXELS, Moments
-from pipeline.report.page import render
+from pipeline.report.page import figure_row, render
 from pipeline.report.style import STYLES, as_png, as_svg, as_webp
 
 PAGE_LIMIT_BYTES = 6_000_000
@@ -296,3 +296,20 @@ def test_pictures_repeat_to_the_byte() -> None:
     assert first == second
     assert Image.open(BytesIO(first[0])).format == "WEBP"
     assert b"Matplotlib" not in first[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "row"),
+    [
+        ("drift_max_mm", 0.092345, ("drift max", "0.0923 mm")),
+        ("force_step_max_n_per_0_1_mm", 0.4144, ("force step max", "0.414 N over 0.1 mm")),
+        ("stiffness_n_per_m", 385.718, ("stiffness", "386 N/m")),
+        ("node_error_far_mm", 6.37693e-06, ("node error far", "6.38e-06 mm")),
+        ("sign_errors", 0, ("sign errors", "0")),
+        ("verdict", "good", ("verdict", "good")),
+    ],
+)
+def test_figures_are_shown_with_their_units_and_no_more_digits_than_they_are_worth(
+    name: str, value: object, row: tuple[str, str]
+) -> None:
+    assert figure_row(name, value) == row

@@ -12,6 +12,21 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "webp": "image/webp"}
 
+UNITS = {
+    "_n_per_0_1_mm": "N over 0.1 mm",
+    "_n_per_mm": "N/mm",
+    "_n_per_ms": "N/ms",
+    "_n_per_m": "N/m",
+    "_n": "N",
+    "_mm": "mm",
+    "_ml": "ml",
+    "_g": "g",
+    "_ms": "ms",
+    "_s": "s",
+    "_deg": "degrees",
+}
+"""What the end of a figure's name says of its unit; longer ends first."""
+
 
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -44,6 +59,19 @@ def picture(caption: str, content: bytes, kind: str) -> Picture:
     """Embed an image; ``kind`` is png, svg or webp."""
     coded = base64.b64encode(content).decode()
     return Picture(caption, f"data:{MEDIA_TYPES[kind]};base64,{coded}")
+
+
+def is_single(value: object) -> bool:
+    """Whether a figure stands for itself and is no list or table."""
+    return not isinstance(value, dict | list)
+
+
+def figure_row(name: str, value: object) -> tuple[str, str]:
+    """A figure as people read it: ``drift_max_mm``, 0.0123 becomes drift max, 0.0123 mm."""
+    ending = next((one for one in UNITS if name.endswith(one)), "")
+    text = f"{value:.3g}" if isinstance(value, float) else str(value)
+    words = name.removesuffix(ending).replace("_", " ")
+    return words, f"{text} {UNITS.get(ending, '')}".strip()
 
 
 def render(

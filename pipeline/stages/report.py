@@ -16,7 +16,7 @@ from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.publish import sealed
 from pipeline.report import heart, pictures
 from pipeline.report.moments import Moments
-from pipeline.report.page import Section, Table, picture, render
+from pipeline.report.page import Section, Table, figure_row, is_single, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg
 
@@ -97,9 +97,10 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     if job.product("register"):
         register = figures_of(job, "register")
         rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
-        expected = f"an error of {register['expected_tre_mm']:.1f} mm is to be expected"
-        said = [register["verdict"], expected, register["reason"]]
+        said = [register["verdict"], register["reason"]]
         rows.append(("registration", "; ".join(filter(None, said))))
+        expected_mm = register["expected_tre_mm"]
+        rows.append(("expected registration error over the heart", f"{expected_mm:.1f} mm"))
     largest = accuracy["distance_error_max_mm"]
     rows.append(("largest distance error of the field", f"{largest:.3f} mm"))
     return rows
@@ -182,15 +183,17 @@ def _field(job: Job, shown: Moments) -> Section:
 
 def _flat(title: str, figures: dict[str, Any]) -> Table:
     """Single figures as rows; what is told per phase or structure stays in the JSON files."""
-    rows = []
+    rows: list[tuple[str, str]] = []
     for name, value in figures.items():
-        words = name.replace("_", " ")
-        parts = value.items() if isinstance(value, dict) else [("", value)]
-        rows += [
-            (f"{words} {part.replace('_', ' ')}", f"{one:.6g}" if isinstance(one, float) else one)
-            for part, one in parts
-            if not isinstance(one, dict | list)
-        ]
+        if isinstance(value, dict):
+            # The unit stands at the end of the group's name, for all of its figures.
+            words, unit = figure_row(name, "")
+            rows += [
+                (f"{words} {part}", f"{text} {unit}".rstrip())
+                for part, text in (figure_row(*one) for one in value.items() if is_single(one[1]))
+            ]
+        elif is_single(value):
+            rows.append(figure_row(name, value))
     return Table((title, ""), rows)
 
 
