@@ -1,12 +1,17 @@
 """What each way to interpolate a field would give: the table of docs/field.md, measured anew.
 
-``python benchmarks/interpolation_table.py [--spacing 1 2] [--structure NAME] [--seed N] [--fit]``
+``python benchmarks/interpolation_table.py [--spacing 1 2] [--structure NAME] [--seed N]
+[--pathology NAME] [--rate BPM] [--fit]``
 
-A beating surface of the phantom is baked at its phases; every way then answers at the true surface
-midway between phases (``--fit``: the chosen way alone, before and after its fit to the surface),
-and in the band about it, where VTK's closest point on the true mesh is the
-truth. All ways run through the same plain kernel, so their times compare with each other but not
-with beatfield.h, which does the one chosen in a third of the time.
+A beating surface of the phantom is baked at its phases; every way then answers at vertices of the
+true surface midway between phases, and in the band about it, where VTK's closest point on the true
+mesh is the truth. All ways run through the same plain kernel, so their times compare with each
+other but not with beatfield.h, which does the one chosen in a third of the time.
+
+``--fit``: the chosen way alone, before and after its fit to the surface, asked in the middles of
+triangles too. The way to the zero is what lies between a point of the true surface and the field's
+zero, along the field's gradient: where that is short, as on a sharp rim, a small distance is a
+longer way.
 """
 
 from __future__ import annotations
@@ -132,13 +137,15 @@ def ask(stored: Float, grid: Grid, way: tuple[int, int], points: Float, moments:
 
 
 def truth_at(
-    meshes: list[Surface], moments: Float, rng: np.random.Generator
+    meshes: list[Surface], moments: Float, rng: np.random.Generator, middles: bool
 ) -> tuple[Truth, Truth]:
     """On the surface, and in the band about it, at moments that nothing was stored for."""
     on, near = [], []
     for mesh, moment in zip(meshes, moments, strict=True):
         vertices = mesh.vertices_mm
         chosen = vertices[rng.choice(len(vertices), min(1500, len(vertices)), replace=False)]
+        if middles:
+            chosen = np.concatenate([chosen, vertices[mesh.triangles].mean(axis=1)])
         on.append((chosen, np.full(len(chosen), moment)))
         points = chosen[:400] + rng.uniform(-1, 1, (400, 3)) * BAND_MM / np.sqrt(3)
         near.append((points, np.full(400, moment), *_closest(mesh, points)))
@@ -178,6 +185,17 @@ def steps(stored: Float, grid: Grid, way: tuple[int, int], near: Truth) -> tuple
     return F_MAX_N * jump, float(np.abs(rates[1] - rates[0]).max())
 
 
+def way_to_zero(stored: Float, grid: Grid, way: tuple[int, int], on: Truth) -> Float:
+    """How far from points of the true surface the field's zero is, mm: Newton's steps to it."""
+    places = on.points_mm.copy()
+    for _ in range(6):
+        found = ask(stored, grid, way, places, on.moments)
+        slope = found[:, 1:4]
+        steep = np.maximum(np.square(slope).sum(axis=1), 0.05)
+        places -= (found[:, 0] / steep)[:, None] * slope
+    return np.asarray(np.linalg.norm(places - on.points_mm, axis=1))
+
+
 def bake(surfaces: list[Surface], spacing_mm: float) -> tuple[Grid, Float]:
     """Exact distances of all phases, ``(phase, z, y, x)``."""
     every = np.concatenate([one.vertices_mm for one in surfaces])
@@ -199,46 +217,72 @@ def nanoseconds(stored: Float, grid: Grid, way: tuple[int, int], rng: np.random.
     return float(np.median(spent))
 
 
-def rows(
-    surfaces: list[Surface], between: list[Surface], spacing_mm: float, seed: int, fit: bool
-) -> None:
+def judged(stored: Float, grid: Grid, way: tuple[int, int], on: Truth, near: Truth) -> str:
+    """The columns of accuracy."""
+    here = np.abs(ask(stored, grid, way, on.points_mm, on.moments)[:, 0])
+    band = ask(stored, grid, way, near.points_mm, near.moments)
+    off = np.abs(band[:, 0] - near.distance_mm)
+    slope = np.linalg.norm(band[:, 1:4] - near.gradient, axis=1)
+    return (
+        f"{here.max():.3f} / {np.percentile(here, 99):.3f} / {np.mean(here > 0.1):.1e} | "
+        f"{np.percentile(off, 99):.3f} | {np.median(slope):.3f} / {np.percentile(slope, 95):.3f}"
+    )
+
+
+def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, seed: int) -> None:
     """Print the table of one spacing."""
     grid, distance_mm = bake(surfaces, spacing_mm)
-    count = len(surfaces)
     rng = np.random.default_rng(seed)
-    on, near = truth_at(
-        between, (np.arange(len(between)) * (count // len(between)) + 0.5) / count, rng
-    )
-    megabytes = distance_mm.size * 4e-6
+    on, near = truth_at(between, midway(surfaces, between), rng, middles=False)
+    megabytes, count = distance_mm.size * 4e-6, len(surfaces)
     print(f"\n{spacing_mm:g} mm, {grid.shape[::-1]} nodes x {count} phases: {megabytes:.1f} MB\n")
     print(
         "| space | time | on the surface, max / 99 % (mm) / share beyond 0.1 mm | band, 99 % (mm) "
         "| gradient, median / 95 % | step of force (N) | step of rate (mm/cycle) | ns |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    ways = [(way, 0) for way in itertools.product(range(4), range(4))]
-    ways = [one for one in ways if one[0][0] == CHOSEN[0] or one[0][1] == CHOSEN[1]]
-    if fit:
-        ways = [(CHOSEN, 0)]
-    for way, rounds in [*ways, (CHOSEN, BakeSettings().fit_rounds)]:
+    for way in itertools.product(range(4), range(4)):
+        if way[0] != CHOSEN[0] and way[1] != CHOSEN[1]:
+            continue
         stored = prepared(distance_mm, *way)
-        start = time.process_time()
-        fit_to_surface(list(stored), *_moving(surfaces, grid), rounds)
-        spent = f", fitted in {time.process_time() - start:.1f} core-s" if rounds else ""
-        here = np.abs(ask(stored, grid, way, on.points_mm, on.moments)[:, 0])
-        band = ask(stored, grid, way, near.points_mm, near.moments)
-        off = np.abs(band[:, 0] - near.distance_mm)
-        slope = np.linalg.norm(band[:, 1:4] - near.gradient, axis=1)
         jump, rate = steps(stored, grid, way, near)
         mark = "**" if way == CHOSEN else ""
         print(
-            f"| {mark}{NAMES[way[0]]}{mark} | {mark}{NAMES[way[1]]}{mark}{spent} | "
-            f"{here.max():.3f} / {np.percentile(here, 99):.3f} / {np.mean(here > 0.1):.1e} | "
-            f"{np.percentile(off, 99):.3f} | "
-            f"{np.median(slope):.3f} / {np.percentile(slope, 95):.3f} | {jump:.4f} | {rate:.3f} | "
+            f"| {mark}{NAMES[way[0]]}{mark} | {mark}{NAMES[way[1]]}{mark} | "
+            f"{judged(stored, grid, way, on, near)} | {jump:.4f} | {rate:.3f} | "
             f"{nanoseconds(stored, grid, way, rng):.0f} |",
             flush=True,
         )
+
+
+def fit_rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, seed: int) -> None:
+    """Print what the fit to the surface makes of the chosen way at one spacing."""
+    grid, distance_mm = bake(surfaces, spacing_mm)
+    rng = np.random.default_rng(seed)
+    on, near = truth_at(between, midway(surfaces, between), rng, middles=True)
+    print(f"\n{spacing_mm:g} mm\n")
+    print(
+        "| rounds | on the surface, max / 99 % (mm) / share beyond 0.1 mm | band, 99 % (mm) "
+        "| gradient, median / 95 % | way to the zero, max (mm) / share beyond 0.1 mm | core-s |"
+    )
+    print("|---|---|---|---|---|---|")
+    for rounds in (0, BakeSettings().fit_rounds):
+        stored = prepared(distance_mm, *CHOSEN)
+        start = time.process_time()
+        fit_to_surface(list(stored), *_moving(surfaces, grid), rounds)
+        spent = time.process_time() - start
+        there = way_to_zero(stored, grid, CHOSEN, on)
+        print(
+            f"| {rounds} | {judged(stored, grid, CHOSEN, on, near)} | "
+            f"{there.max():.3f} / {np.mean(there > 0.1):.1e} | {spent:.1f} |",
+            flush=True,
+        )
+
+
+def midway(surfaces: list[Surface], between: list[Surface]) -> Float:
+    """Moments of the surfaces between the phases."""
+    count = len(surfaces)
+    return (np.arange(len(between)) * (count // len(between)) + 0.5) / count
 
 
 def _moving(surfaces: list[Surface], grid: Grid) -> tuple[Float, Grid, MovingSurface]:
@@ -253,17 +297,20 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, nargs="+", default=[0.75, 1.0, 1.5, 2.0])
     parser.add_argument("--structure", default="epicardium")
     parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--pathology", default="healthy")
+    parser.add_argument("--rate", type=float, default=70.0, help="beats a minute")
     parser.add_argument("--phases", type=int, default=25)
     parser.add_argument("--fit", action="store_true", help="the chosen way alone")
     chosen = parser.parse_args()
-    heart = draw_heart(np.random.default_rng(chosen.seed))
+    rng = np.random.default_rng(chosen.seed)
+    heart = draw_heart(rng, pathology=chosen.pathology, heart_rate_bpm=chosen.rate)
     every = np.arange(chosen.phases) / chosen.phases
     surfaces, between = (
         [Surface(*heart.surfaces(float(phase))[chosen.structure]) for phase in phases]
         for phases in (every, every + 0.5 / chosen.phases)
     )
     for spacing_mm in chosen.spacing:
-        rows(surfaces, between, spacing_mm, chosen.seed, chosen.fit)
+        (fit_rows if chosen.fit else rows)(surfaces, between, spacing_mm, chosen.seed)
 
 
 if __name__ == "__main__":

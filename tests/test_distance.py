@@ -223,9 +223,12 @@ def some_nodes(grid: Grid, count: int, seed: int = 0) -> Integer:
     return np.random.default_rng(seed).choice(int(np.prod(grid.shape)), count, replace=False)
 
 
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.4, 1.1, 2.7), (3.1, 0.7, 0.3)])
+@pytest.mark.parametrize(
+    "spacing", [(1.0, 1.0, 1.0), (0.4, 1.1, 2.7), (3.1, 0.7, 0.3), (2.5, 3.0, 2.8)]
+)
 def test_many_small_triangles_agree_with_vtk(spacing):
-    """More nodes than one block has, and boxes of triangles on several levels."""
+    """More nodes than one block has, and boxes of triangles on several levels; at last a grid so
+    coarse that the smallest blocks hold no single triangles."""
     shape = tuple(int(np.ceil(52 / step)) for step in spacing[::-1])
     surface = lumpy(11, level=5, radius=15.0)
     grid = Grid(shape, (-26.0, -25.5, -25.2), spacing)

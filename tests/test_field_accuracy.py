@@ -25,10 +25,11 @@ def test_stiffness_off_the_medial_axis_is_the_laws_and_the_rate_on_it_is_within_
     rng = np.random.default_rng(3)
     for name, one in said.items():
         law = FIXTURES[name]
-        # The size of the force changes by f_max f'(q) times the gradient's length, and a spline
-        # through a kink overshoots the slope of 1 by less than a quarter.
+        # The size of the force changes by f_max f'(q) times the gradient's length. A quadratic
+        # spline through the tip of a cone, as the distance is in the middle of a ball, is steepest
+        # beside a tip on a node: 1.473 (SciPy's spline_filter of order 2 of |x| on 17^3 nodes).
         ratio = one["stiffness_measured_n_per_m"] / law.stiffness_n_per_m
-        assert 0.9 < ratio < 1.25
+        assert 0.9 < ratio < 1.48
         bound = 8 * law.f_max_n / SETTINGS.spacing_mm + law.stiffness_n_per_m / 1000
         assert one["force_rate_bound_n_per_mm"] == pytest.approx(bound)
         # Steps of 1 um about the middle of the balls, which is their medial axis.
@@ -87,22 +88,32 @@ def test_the_fit_brings_the_zero_to_the_surface(tmp_path):
     assert 0 < moved.max() <= stated_mm
 
 
-def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
-    """Truth: the phantom's left ventricle midway between 25 phases, which nothing was given."""
-    heart = draw_heart(np.random.default_rng(5))
+@pytest.mark.parametrize(
+    ("structure", "seed", "pathology"),
+    [("epicardium", 5, "healthy"), ("left_atrium", 11, "enlarged_atrium")],
+)
+def test_between_phases_the_surface_is_the_true_one_of_the_phantom(
+    tmp_path, structure, seed, pathology
+):
+    """Truth: the phantom's surface at moments between 25 phases, which nothing was given: its
+    vertices, and the middles of its triangles, which the fit is not told of at any moment. The
+    atrium has rims about its veins and appendage, where its triangles meet at up to 59 degrees."""
+    heart = draw_heart(np.random.default_rng(seed), pathology=pathology, heart_rate_bpm=70.0)
     phases = np.arange(25) / 25
-    each = [heart.surfaces(float(phase))["epicardium"] for phase in phases]
+    each = [heart.surfaces(float(phase))[structure] for phase in phases]
     moving = MovingSurface(np.stack([one[0] for one in each]), each[0][1], phases)
-    fixture = Fixture(structure="epicardium", kind="guidance", delta_mm=8.0, f_max_n=1.0)
+    fixture = Fixture(structure=structure, kind="guidance", delta_mm=8.0, f_max_n=1.0)
     said = bake_field(
-        tmp_path / "f.zarr", {"epicardium": moving}, {"g": fixture}, BakeSettings(samples=100)
+        tmp_path / "f.zarr", {structure: moving}, {"g": fixture}, BakeSettings(samples=100)
     )
     field = ForceField.open(tmp_path / "f.zarr")
     off = []
-    for moment in (phases + 0.02)[::4]:
-        vertices_mm, _ = heart.surfaces(float(moment))["epicardium"]
-        off.append(np.abs(field.distance_mm(vertices_mm, moment)))
+    for moment in np.concatenate([(phases + 0.02)[::5], (phases + 0.011)[2::5]]):
+        vertices_mm, triangles = heart.surfaces(float(moment))[structure]
+        asked = np.concatenate([vertices_mm, vertices_mm[triangles].mean(axis=1)])
+        off.append(np.abs(field.distance_mm(asked, moment)))
     off_mm = np.concatenate(off)
-    assert np.percentile(off_mm, 99.9) < 0.1
-    assert off_mm.max() < 0.15
+    # What is asked of the field.
+    assert off_mm.max() < 0.1
+    assert np.percentile(off_mm, 99) < 0.06
     assert said["drift_max_mm"] == pytest.approx(off_mm.max(), rel=0.5)

@@ -67,7 +67,14 @@ def test_certificate_has_a_figure_for_each_part(tmp_path):
 
     assert set(said["structures"]) == {"ball", "core"}
     assert set(said["fixtures"]) == set(FIXTURES)
-    assert len(said["structures"]["ball"]["distance_error_max_mm_by_phase"]) == len(PHASES)
+    for parts in (said["structures"], said["fixtures"]):
+        for one in parts.values():
+            by_phase = {name: values for name, values in one.items() if name.endswith("_by_phase")}
+            assert {len(values) for values in by_phase.values()} == {len(PHASES)}
+            for name, values in by_phase.items():
+                over_all = one[name.removesuffix("_by_phase")]
+                assert min(values) <= over_all
+                assert "median" in name or over_all == max(values)
     largest = max(one["distance_error_max_mm"] for one in said["structures"].values())
     assert said["distance_error_max_mm"] == largest
     for figure in ("force_step_max_n", "force_step_max_n_per_0_1_mm", "stiffness_n_per_m"):
@@ -88,6 +95,9 @@ def test_directions_and_drift_of_a_ball_are_small(tmp_path):
     fixture = Fixture(structure="ball", kind="guidance", delta_mm=8.0, f_max_n=1.0)
     said = bake_field(tmp_path / "f.zarr", {"ball": swing}, {"hold": fixture}, SETTINGS, rr_s=0.8)
     assert 0 < said["direction_error_median_deg"] < 5
+    # The error is at least as long as the turn makes it, a chord of the unit circle.
+    chord = 2 * np.sin(np.radians(said["direction_error_median_deg"]) / 2)
+    assert 0.9 * chord < said["gradient_error_median"] < 0.1
     # In time 2 mm * (2 pi / 12)^3 / 24; in space what the corners, the sharpest places of the
     # facets, are off by at the phases themselves.
     in_space = 2 * said["surface_error_max_mm"]

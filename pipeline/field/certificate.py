@@ -144,19 +144,20 @@ def _distance_errors(
         "near": float(off_mm[near].max(initial=0.0)),
         "far": float(off_mm[~near].max(initial=0.0)),
         "signs": int(wrong.sum()),
-        "turned": _direction_errors(volume, structure, float(phase), surface, exact, rng),
+        **_gradient_errors(volume, structure, float(phase), surface, exact, rng),
     }
 
 
-def _direction_errors(
+def _gradient_errors(
     volume: ForceField,
     structure: str,
     phase: float,
     surface: Surface,
     exact: ExactSurface,
     rng: np.random.Generator,
-) -> Float:
-    """Angles in degrees between the gradient and the way to the nearest point of the surface."""
+) -> dict[str, Float]:
+    """How far the gradient is from the true one, which points from the nearest point of the
+    surface and is 1 long: the length of the difference, and the angle between them in degrees."""
     points_mm = points_about(surface, rng, DIRECTION_SAMPLES, DIRECTION_BAND_MM)
     distance_mm, nearest_mm = exact.nearest(points_mm)
     # On the surface itself the way to it has no direction.
@@ -164,45 +165,56 @@ def _direction_errors(
     away = (points_mm - nearest_mm)[clear] / distance_mm[clear, None]
     gradient = volume.gradient(points_mm[clear], phase, structure)
     cosine = np.einsum("ij,ij->i", away, gradient) / np.linalg.norm(gradient, axis=1)
-    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return {
+        "slope": np.linalg.norm(gradient - away, axis=1),
+        "turned": np.degrees(np.arccos(np.clip(cosine, -1, 1))),
+    }
 
 
 def _over_phases(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    between, surface, turned = (
-        np.concatenate([one[part] for one in found]) for part in ("between", "surface", "turned")
+    between, surface, slope, turned = (
+        np.concatenate([one[part] for one in found])
+        for part in ("between", "surface", "slope", "turned")
     )
     return {
         "distance_error_max_mm": float(between.max()),
         "distance_error_p99_mm": float(np.percentile(between, 99)),
-        "distance_error_max_mm_by_phase": [float(one["between"].max()) for one in found],
         "surface_error_max_mm": float(surface.max()),
         "surface_error_p99_mm": float(np.percentile(surface, 99)),
         "node_error_near_mm": max(one["near"] for one in found),
         "node_error_far_mm": max(one["far"] for one in found),
+        "gradient_error_median": float(np.median(slope)),
+        "gradient_error_p99": float(np.percentile(slope, 99)),
         "direction_error_median_deg": float(np.median(turned)),
         "direction_error_p99_deg": float(np.percentile(turned, 99)),
         "sign_errors": sum(one["signs"] for one in found),
+        "distance_error_max_mm_by_phase": [float(one["between"].max()) for one in found],
+        "surface_error_max_mm_by_phase": [float(one["surface"].max()) for one in found],
+        "gradient_error_median_by_phase": [float(np.median(one["slope"])) for one in found],
+        "sign_errors_by_phase": [one["signs"] for one in found],
     }
 
 
-def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[str, float | None]:
+def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[str, Any]:
     """How far the field's surface is, halfway between phases, from the smoothly moving one.
 
-    The measure is the interpolated distance at all vertices, on their own periodic spline in time;
-    None where vertices do not correspond, or phases are too few for a spline.
+    The measure is the interpolated distance at all vertices, which follow their own periodic spline
+    in time, and in the middles of the triangles; None where vertices do not correspond, or phases
+    are too few for a spline.
     """
     motion = Motion.of(moving)
     if motion is None:
-        return {"drift_max_mm": None, "drift_p99_mm": None}
-    off_mm = np.concatenate(
-        [
-            volume.distance_mm(motion.at(moment).vertices_mm, moment, structure)
-            for moment in halfway(volume.phases).tolist()
-        ]
-    )
+        return {"drift_max_mm": None, "drift_p99_mm": None, "drift_max_mm_by_phase": None}
+    off = []
+    for moment in halfway(volume.phases).tolist():
+        surface = motion.at(moment)
+        middles_mm = surface.vertices_mm[surface.triangles].mean(axis=1)
+        asked_mm = np.concatenate([surface.vertices_mm, middles_mm])
+        off.append(np.abs(volume.distance_mm(asked_mm, moment, structure)))
     return {
-        "drift_max_mm": float(np.abs(off_mm).max()),
-        "drift_p99_mm": float(np.percentile(np.abs(off_mm), 99)),
+        "drift_max_mm": float(np.max([one.max() for one in off])),
+        "drift_p99_mm": float(np.percentile(np.concatenate(off), 99)),
+        "drift_max_mm_by_phase": [float(one.max()) for one in off],
     }
 
 
@@ -261,7 +273,10 @@ class _ForceSteps:
         volume, name = self._volume, self._name
         surface = self._surface.at(index)
         points_mm = points_about(surface, rng, FORCE_SAMPLES, self._near_mm + BAND_MM)
-        moments = rng.uniform(size=len(points_mm))
+        # Between this phase and the next.
+        phases = volume.phases
+        length = (phases[(index + 1) % len(phases)] - phases[index]) % 1 or 1.0
+        moments = phases[index] + length * rng.uniform(size=len(points_mm))
         here_n = volume.force_n(points_mm, moments, name)
         ways = rng.normal(size=points_mm.shape)
         ways *= STEP_MM / np.linalg.norm(ways, axis=1, keepdims=True)
@@ -306,4 +321,7 @@ class _ForceSteps:
             "stiffness_measured_n_per_m": max(slopes),
             "stiffness_n_per_m": self._fixture.stiffness_n_per_m,
             "stiffness_limit_n_per_m": DEVICES[self._fixture.device].stiffness_n_per_m,
+            "force_step_max_n_per_0_1_mm_by_phase": list(steps),
+            "force_change_max_n_per_ms_by_phase": None if None in lates else list(lates),
+            "stiffness_measured_n_per_m_by_phase": list(slopes),
         }

@@ -211,7 +211,7 @@ class Bounds(Section):
 class BakeSettings(Section):
     """How surfaces become grids."""
 
-    spacing_mm: float = Field(default=2.0, gt=0)
+    spacing_mm: float = Field(default=1.5, gt=0)
     """Distance between grid nodes, the same on every axis."""
 
     margin_mm: float = Field(default=15.0, ge=15)
@@ -221,7 +221,7 @@ class BakeSettings(Section):
     """Surfaces to bake beside those that a fixture needs."""
 
     fit_rounds: int = Field(default=12, ge=0, le=100)
-    """Steps of the least squares that bring the interpolated zero to the moving surface, between
+    """Rounds of the least squares that bring the interpolated zero to the moving surface, between
     nodes and phases too; 0 leaves the plain interpolation."""
 
     samples: int = Field(default=500, ge=100)

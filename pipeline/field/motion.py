@@ -65,6 +65,12 @@ class Motion:
         return Surface(np.tensordot(self.weights(phase), self.places_mm, 1), self.triangles)
 
 
+def between(phases: Float, count: int) -> Float:
+    """``count`` moments a stored phase, evenly up to the next; the stored phases are among them."""
+    steps = np.diff(phases, append=phases[0] + 1)[:, None] / count
+    return np.asarray(phases[:, None] + steps * np.arange(count)).ravel()
+
+
 def halfway(phases: Float) -> Float:
     """Moments in the middle between stored phases, the last with the first of the next beat."""
     return np.asarray(phases + np.diff(phases, append=phases[0] + 1) / 2)

@@ -28,7 +28,7 @@ from pipeline.geometry import Float, Float32, Integer
 # Nodes along the side of a task of one thread, and of a cube that is measured at once.
 TOP, LEAST = 32, 2
 CORNERS = 8
-# One list for all boxes, for blocks of 32, 16, 8 and 4 nodes a side, and one to open boxes into.
+# One list for all boxes, for blocks of 32, 16, 8 and 4 nodes a side, and one for a cube.
 DEPTHS = 6
 # Lists are worked on in whole vectors; what is behind their end is worked on in vain.
 LANES = 16
@@ -83,13 +83,14 @@ class Work(NamedTuple):
 
 
 def levels_of_blocks(tree: TriangleTree, spacing_mm: tuple[float, float, float]) -> Integer:
-    """Level of the boxes that blocks of 32, 16, 8 and 4 nodes a side hold."""
+    """Level of the boxes that blocks of 32, 16, 8 and 4 nodes a side hold: single triangles in the
+    end, but where those are much finer than the grid."""
     sizes_mm, mean_mm = typical_size_mm(tree), float(np.mean(spacing_mm))
     levels = []
-    for nodes in (32, 16, 8):
+    for nodes in (32, 16, 8, 4):
         half_mm = BOX_TO_BLOCK * 0.5 * (nodes - 1) * mean_mm
         levels.append(max((k for k, size in enumerate(sizes_mm) if size <= half_mm), default=0))
-    return np.array([*levels, 0])
+    return np.array(levels)
 
 
 @njit(nogil=True, cache=True)
@@ -301,6 +302,16 @@ def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def _open_all(tree, work, depth):  # type: ignore[no-untyped-def]
+    """Open a list's boxes that can hold the nearest, down to triangles; where that list is."""
+    source = depth
+    while work.held[source] > 0:
+        _open(tree, work, source, depth + 1, _narrow(tree, work, source))
+        source = depth + 1
+    return source
+
+
+@njit(nogil=True, cache=True)
 def _list_all(tree, work):  # type: ignore[no-untyped-def]
     """Make the list at depth 0: all boxes of the last level."""
     first = NOUGHT
@@ -377,7 +388,7 @@ def block_distance(tree, levels, axes, z, y, x, out):  # type: ignore[no-untyped
             continue
         _place(tree, work, axes, (z, y, x), size)
         if size == LEAST:
-            _fill_cube(tree, work, axes, depth, (z, y, x), out)
+            _fill_cube(tree, work, axes, _open_all(tree, work, depth), (z, y, x), out)
             continue
         _enter(tree, work, depth, levels[depth])
         depth += 1

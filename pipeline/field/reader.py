@@ -72,9 +72,8 @@ class ForceField:
         self._grid = Grid(grid.shape_zyx, grid.origin_mm, grid.spacing_mm)
         self._phases = np.array(metadata.phases)
         per_mm = 1 / np.array(grid.spacing_mm)
-        self._numbers = np.array(
-            [*grid.origin_mm, *grid.spacing_mm, *grid.shape_zyx[::-1], *per_mm]
-        )
+        shape = grid.shape_zyx[::-1]
+        self._numbers = np.array([*grid.origin_mm, *grid.spacing_mm, *shape, *per_mm])
         self._line = timeline(self._phases)
         parts = metadata.structures
         self._distances = {name: self._map(part.path) for name, part in parts.items()}
@@ -157,6 +156,7 @@ class ForceField:
     def contains(self, points_mm: npt.ArrayLike) -> Mask:
         """Which of ``(n, 3)`` points lie in the grid."""
         points = _as_points(points_mm)
+        _require_finite(points)
         inside = (points >= self._grid.origin_mm) & (points <= self._grid.upper_mm)
         return np.asarray(inside.all(axis=1))
 
@@ -218,11 +218,12 @@ class ForceField:
         points = _as_points(points_mm)
         phases = _as_phases(phase, len(points))
         force_n = np.empty((len(points), 3))
-        in_parts(
-            lambda part, moments: sample_force(law, points[part], moments, force_n[part]),
-            phases,
-            len(points),
-        )
+
+        def ask(part: slice, moments: Float) -> None:
+            _require_finite(points[part], moments, part.start)
+            sample_force(law, points[part], moments, force_n[part])
+
+        in_parts(ask, phases, len(points))
         return force_n
 
     def distance_at(
@@ -360,13 +361,12 @@ class ForceField:
         phases = _as_phases(phase, len(points))
         distance_mm, gradient = np.empty(len(points)), np.empty((len(points), 3))
         field = (self._addresses[structure], self._line, self._numbers)
-        in_parts(
-            lambda part, moments: sample(
-                *field, points[part], moments, distance_mm[part], gradient[part]
-            ),
-            phases,
-            len(points),
-        )
+
+        def ask(part: slice, moments: Float) -> None:
+            _require_finite(points[part], moments, part.start)
+            sample(*field, points[part], moments, distance_mm[part], gradient[part])
+
+        in_parts(ask, phases, len(points))
         return distance_mm, gradient
 
 
@@ -376,13 +376,20 @@ def _not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputErr
     )
 
 
+def _require_finite(points: Float, phases: Float | None = None, first: int = 0) -> None:
+    """Raise InputError unless all numbers are finite; ``first`` is the first point's number."""
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        where = f"point {first + bad} is not finite: {points[bad]}"
+        raise InputError(f"{where}; every coordinate must be mm")
+    if phases is not None and not np.isfinite(phases).all():
+        raise InputError("phase must be finite: a share of the heartbeat, whose fraction counts")
+
+
 def _as_points(points_mm: npt.ArrayLike) -> Float:
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points must be (n, 3) in mm, got an array of shape {points.shape}")
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(f"point {bad} is not finite: {points[bad]}; every coordinate must be mm")
     return points
 
 
@@ -390,8 +397,4 @@ def _as_phases(phase: npt.ArrayLike, count: int) -> Float:
     phases = np.atleast_1d(np.asarray(phase, dtype=np.float64))
     if phases.shape not in {(1,), (count,)}:
         raise InputError(f"phase must be one number or ({count},), got shape {phases.shape}")
-    if not np.isfinite(phases).all():
-        raise InputError(
-            "phase must be finite; it is a share of the heartbeat, and its fraction counts"
-        )
     return phases

@@ -4,8 +4,11 @@ The spline through exact distances takes them at the nodes; between nodes and be
 rounds off whatever is sharper than the grid. Its coefficients about the surface are therefore
 corrected by a small change that brings the interpolated distance at points of the moving surface
 close to zero: damped least squares by conjugate gradients on the normal equations (CGLS; Björck,
-Numerical Methods for Least Squares Problems, SIAM 1996), stopped after a few steps. Points are
-asked for at the stored phases and halfway between, where vertices follow their own spline in time.
+Numerical Methods for Least Squares Problems, SIAM 1996), scaled by the diagonal. After every round
+the points that are still too far off get more weight, in proportion to it: so Lawson's
+algorithm goes from least squares to the least maximum (Lawson, Contributions to the theory of
+linear least maximum approximations, UCLA 1961). Points are asked for at three moments a stored
+phase, where vertices follow their own spline in time.
 """
 
 from __future__ import annotations
@@ -16,14 +19,22 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pipeline.field.motion import BeatingSurface, Motion, halfway
+from pipeline.field.motion import BeatingSurface, Motion, between
 from pipeline.field.spline import phase_weights, timeline
-from pipeline.geometry import Float, Float32, Grid, Surface
+from pipeline.geometry import Float, Float32, Grid, Integer, Surface
 
-POINTS_A_CELL = 6.0
-"""Points of the surface for each square of the grid's spacing."""
-DAMPING = 0.1
+MOMENTS_A_PHASE = 3
+POINTS_A_CELL = 2.0
+"""Points of the surface for each square of the grid's spacing, beside vertices and edges."""
+DAMPING = 0.06
 """Weight of a coefficient's squared change beside the squared distance of one point."""
+NEAR_ENOUGH = 0.035
+"""A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
+weight: to bring it nearer still would cost the gradient about it more than it is worth."""
+MOST_WEIGHT = 500.0
+STEPS_A_ROUND = 4
+# Minima and maxima aside, only the order of sums may change.
+FAST = {"contract", "nnan", "nsz"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +67,7 @@ def fit_to_surface(
     moving
         The surface, LPS mm.
     rounds
-        Steps of the conjugate gradients; nothing is changed when 0.
+        How often the weights of the points are set; nothing is changed when 0.
 
     Returns
     -------
@@ -64,7 +75,7 @@ def fit_to_surface(
     """
     if rounds == 0:
         return 0.0
-    places = [(phase, _spread_over(one, grid)) for phase, one in _surfaces(moving, phases)]
+    places = [(phase, _inside(points, grid)) for phase, points in _places(moving, phases, grid)]
     low, high = _box([points_mm for _, points_mm in places], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     line = timeline(phases)
@@ -75,38 +86,57 @@ def fit_to_surface(
         moments.append(
             _Moment(nodes.astype(np.float32), interval, np.array(weights, dtype=np.float32))
         )
-    coefficients = np.stack([one[box] for one in splines])
-    change = _least_squares(coefficients, moments, rounds)
+    del places
+    near = np.stack([one[box] for one in splines])
+    change = _Fit(near, moments, min(grid.spacing_mm)).after(rounds)
     for one, part in zip(splines, change, strict=True):
         one[box] += part
     return float(np.abs(change).max())
 
 
-def _surfaces(moving: BeatingSurface, phases: Float) -> Iterator[tuple[float, Surface]]:
-    """What is known of a surface: stored phases, and between them where vertices correspond."""
-    for index, phase in enumerate(phases):
-        yield float(phase), moving.at(index)
+def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[tuple[float, Float]]:
+    """Moments and ``(n, 3)`` points: those of stored phases, and where vertices correspond the
+    same material points between them."""
+    step_mm = min(grid.spacing_mm)
     motion = Motion.of(moving)
-    if motion:
-        for phase in halfway(phases):
-            yield float(phase), motion.at(float(phase))
+    if motion is None:
+        for index, phase in enumerate(phases.tolist()):
+            surface = moving.at(index)
+            yield phase, _carried(surface, *_spread_over(surface, step_mm))
+        return
+    corners, shares = _spread_over(moving.at(0), step_mm)
+    for phase in between(phases, MOMENTS_A_PHASE).tolist():
+        yield phase, _carried(motion.at(phase), corners, shares)
 
 
-def _spread_over(surface: Surface, grid: Grid) -> Float:
-    """``(n, 3)`` points spread evenly over a surface, and vertices, which stand out most, mm."""
-    corners = surface.vertices_mm[surface.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
+    """Points spread evenly over a surface, its vertices, which stand out most, and the middles of
+    its edges: ``(n, 3)`` vertex numbers and their shares."""
+    triangles = surface.triangles
+    corners_mm = surface.vertices_mm[triangles]
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     area = np.cumsum(np.linalg.norm(across, axis=1)) / 2
-    count = int(np.ceil(POINTS_A_CELL * area[-1] / min(grid.spacing_mm) ** 2))
+    count = int(np.ceil(POINTS_A_CELL * area[-1] / step_mm**2))
     chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
     # An even sequence in the square (Roberts 2018: powers of the inverse of the plastic number),
     # folded into the triangle.
     u, v = (np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532) % 1).T
     u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
-    weights = np.stack([1 - u - v, u, v], axis=1)
-    inner = np.einsum("nk,nkd->nd", weights, corners[chosen])
-    vertices_mm = surface.vertices_mm[:: max(1, len(surface.vertices_mm) // count)]
-    return _inside(np.concatenate([inner, vertices_mm]), grid)
+    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))
+    edges = np.unique(sides, axis=0)[:, [0, 1, 1]]
+    vertices = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
+    # A mesh that is much finer than the grid has more of them than it takes.
+    some = [one[:: max(1, len(one) // (2 * count))] for one in (vertices, edges)]
+    shares = [np.stack([1 - u - v, u, v], axis=1)]
+    shares += [np.tile((0.5, 0.25, 0.25), (len(one), 1)) for one in some]
+    return np.concatenate([triangles[chosen], *some]), np.concatenate(shares)
+
+
+def _carried(surface: Surface, corners: Integer, shares: Float) -> Float:
+    """Where material points are: ``(n, 3)``, mm."""
+    return np.asarray(
+        sum(shares[:, [k]] * surface.vertices_mm[corners[:, k]] for k in range(3)), dtype=float
+    )
 
 
 def _inside(points_mm: Float, grid: Grid) -> Float:
@@ -131,88 +161,182 @@ def _box(points_mm: Sequence[Float], grid: Grid) -> tuple[list[int], list[int]]:
     return low.tolist(), high.tolist()
 
 
-def _least_squares(coefficients: Float32, moments: Sequence[_Moment], rounds: int) -> Float32:
-    """The change of the coefficients after ``rounds`` steps from none."""
-    off = [-_values(coefficients, one) for one in moments]
-    change = np.zeros_like(coefficients)
-    slope = _slope(change, moments, off)
-    way, length2 = slope.copy(), _squares([slope])
-    for _ in range(rounds):
-        along = [_values(way, one) for one in moments]
-        curvature = _squares(along) + DAMPING * _squares([way])
-        # Nothing is left to do on a surface that the spline already has.
-        if curvature == 0:
-            break
-        step = np.float32(length2 / curvature)
-        change += step * way
-        off = [old - step * one for old, one in zip(off, along, strict=True)]
-        slope = _slope(change, moments, off)
-        before, length2 = length2, _squares([slope])
-        way *= np.float32(length2 / before)
-        way += slope
-    return change
+class _Fit:
+    """The change that brings coefficients ``(phase, z, y, x)`` to zero at all points."""
+
+    def __init__(
+        self, coefficients: Float32, moments: Sequence[_Moment], spacing_mm: float
+    ) -> None:
+        self._moments = moments
+        self._near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
+        self._layer = np.empty_like(coefficients[0])
+        self._change = np.zeros_like(coefficients)
+        self._off = [-one for one in self._values(coefficients)]
+        self._weights = [np.ones_like(one) for one in self._off]
+
+    def after(self, rounds: int) -> Float32:
+        """The change after some rounds of reweighted least squares."""
+        for number in range(rounds):
+            if number:
+                self._weigh()
+            self._least_squares()
+        return self._change
+
+    def _weigh(self) -> None:
+        """More weight to points that are too far off."""
+        for weight, off in zip(self._weights, self._off, strict=True):
+            weight *= np.maximum(np.abs(off) / self._near_enough_mm, np.float32(1))
+            np.minimum(weight, np.float32(MOST_WEIGHT), out=weight)
+
+    def _least_squares(self) -> None:
+        """A few steps down the sum of squares."""
+        scale = self._scale()
+        slope = self._slope()
+        way = scale * slope
+        length2 = _product(slope, way)
+        for _ in range(STEPS_A_ROUND):
+            along = self._values(way)
+            pairs = zip(self._weights, along, strict=True)
+            curvature = DAMPING * _product(way, way)
+            curvature += sum(_product(weight * one, one) for weight, one in pairs)
+            # Nothing is left to do on a surface that the spline already has.
+            if curvature == 0:
+                break
+            step = np.float32(length2 / curvature)
+            self._change += step * way
+            for off, one in zip(self._off, along, strict=True):
+                off -= step * one
+            slope = self._slope()
+            down = scale * slope
+            before, length2 = length2, _product(slope, down)
+            way *= np.float32(length2 / before)
+            way += down
+
+    def _slope(self) -> Float32:
+        """Down which way the sum of squares falls."""
+        slope = np.float32(-DAMPING) * self._change
+        for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
+            self._layer[:] = 0
+            _scatter(self._layer, one.nodes, weight * off)
+            _share(slope, one.interval, one.weights, self._layer)
+        return slope
+
+    def _scale(self) -> Float32:
+        """One over the diagonal of the normal equations."""
+        diagonal = np.full_like(self._change, np.float32(DAMPING))
+        for one, weight in zip(self._moments, self._weights, strict=True):
+            self._layer[:] = 0
+            _scatter_squares(self._layer, one.nodes, weight)
+            _share(diagonal, one.interval, one.weights**2, self._layer)
+        return np.asarray(np.float32(1) / diagonal)
+
+    def _values(self, coefficients: Float32) -> list[Float32]:
+        """Interpolated distances at all points."""
+        values = []
+        for one in self._moments:
+            _mix(coefficients, one.interval, one.weights, self._layer)
+            found = np.empty(len(one.nodes), dtype=np.float32)
+            _gather(self._layer, one.nodes, found)
+            values.append(found)
+        return values
 
 
-def _slope(change: Float32, moments: Sequence[_Moment], off: Sequence[Float32]) -> Float32:
-    """Down which way the sum of squares falls."""
-    slope = np.float32(-DAMPING) * change
-    for one, values in zip(moments, off, strict=True):
-        _scatter(slope, one.nodes, one.interval, one.weights, values)
-    return slope
-
-
-def _squares(parts: Sequence[Float32]) -> float:
+def _product(one: Float32, other: Float32) -> float:
     # A product by BLAS would be summed in an order that depends on its threads.
-    return float(sum(np.square(one).sum(dtype=float) for one in parts))
+    return float(np.multiply(one, other).sum(dtype=float))
 
 
-def _values(coefficients: Float32, moment: _Moment) -> Float32:
-    found = np.empty(len(moment.nodes), dtype=np.float32)
-    _gather(coefficients, moment.nodes, moment.interval, moment.weights, found)
-    return found
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _mix(coefficients, interval, weights, layer):  # type: ignore[no-untyped-def]
+    """Coefficients at one moment: those of three phases, weighted."""
+    count, into = len(coefficients), layer.ravel()
+    before = coefficients[(interval - 1) % count].ravel()
+    at, after = coefficients[interval].ravel(), coefficients[(interval + 1) % count].ravel()
+    early, middle, late = weights[0], weights[1], weights[2]
+    for n in range(len(into)):
+        into[n] = early * before[n] + middle * at[n] + late * after[n]
 
 
-@njit(nogil=True, cache=True)
-def _weigh(place, weights):  # type: ignore[no-untyped-def]
-    """Weights of the three nodes about a place on an axis; the first node's number."""
-    middle = int(np.floor(place + np.float32(0.5)))
-    t = place - np.float32(middle)
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _share(target, interval, weights, layer):  # type: ignore[no-untyped-def]
+    """Add what acts at one moment to three phases, by their weights."""
+    count, given = len(target), layer.ravel()
+    for step in range(3):
+        phase, weight = target[(interval + step - 1) % count].ravel(), weights[step]
+        for n in range(len(given)):
+            phase[n] += weight * given[n]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST, inline="always")
+def _weigh(place):  # type: ignore[no-untyped-def]
+    """First of the three nodes about a place on an axis, and their weights."""
     half = np.float32(0.5)
-    weights[0] = half * (half - t) * (half - t)
-    weights[1] = np.float32(0.75) - t * t
-    weights[2] = half * (half + t) * (half + t)
-    return middle - 1
+    middle = int(place + half)
+    t = place - np.float32(middle)
+    early, late = half - t, half + t
+    return middle - 1, (half * early * early, np.float32(0.75) - t * t, half * late * late)
 
 
-@njit(nogil=True, cache=True)
-def _gather(coefficients, nodes, interval, in_time, found):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _gather(layer, nodes, found):  # type: ignore[no-untyped-def]
     """Interpolated distances at points of one moment."""
-    count, w = len(coefficients), np.empty((3, 3), np.float32)
+    height, width = layer.shape[1], layer.shape[2]
+    values = layer.ravel()
     for n in range(len(nodes)):
-        x, y, z = _weigh(nodes[n, 0], w[0]), _weigh(nodes[n, 1], w[1]), _weigh(nodes[n, 2], w[2])
-        value = np.float32(0)
-        for t in range(3):
-            phase = coefficients[(interval + t - 1) % count]
-            for k in range(3):
-                for j in range(3):
-                    row = phase[z + k, y + j]
-                    line = w[0, 0] * row[x] + w[0, 1] * row[x + 1] + w[0, 2] * row[x + 2]
-                    value += in_time[t] * w[2, k] * w[1, j] * line
+        x, (a0, a1, a2) = _weigh(nodes[n, 0])
+        y, along_y = _weigh(nodes[n, 1])
+        z, along_z = _weigh(nodes[n, 2])
+        plane, value = (z * height + y) * width + x, np.float32(0)
+        for c in along_z:
+            row, line = plane, np.float32(0)
+            for b in along_y:
+                line += b * (a0 * values[row] + a1 * values[row + 1] + a2 * values[row + 2])
+                row += width
+            value += c * line
+            plane += height * width
         found[n] = value
 
 
-@njit(nogil=True, cache=True)
-def _scatter(target, nodes, interval, in_time, values):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True, fastmath=FAST, inline="always")
+def _add(target, width, height, first, shares, value):  # type: ignore[no-untyped-def]
+    """Add a value to 27 nodes, by the product of three shares."""
+    (a0, a1, a2), along_y, along_z = shares
+    plane = first
+    for c in along_z:
+        row, part = plane, value * c
+        for b in along_y:
+            here = part * b
+            target[row] += here * a0
+            target[row + 1] += here * a1
+            target[row + 2] += here * a2
+            row += width
+        plane += height * width
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _scatter(layer, nodes, values):  # type: ignore[no-untyped-def]
     """Add to every coefficient the values of the points that it acts on, by its weight there."""
-    count, w = len(target), np.empty((3, 3), np.float32)
+    height, width = layer.shape[1], layer.shape[2]
+    target = layer.ravel()
     for n in range(len(nodes)):
-        x, y, z = _weigh(nodes[n, 0], w[0]), _weigh(nodes[n, 1], w[1]), _weigh(nodes[n, 2], w[2])
-        for t in range(3):
-            phase = target[(interval + t - 1) % count]
-            for k in range(3):
-                for j in range(3):
-                    row = phase[z + k, y + j]
-                    part = values[n] * in_time[t] * w[2, k] * w[1, j]
-                    row[x] += part * w[0, 0]
-                    row[x + 1] += part * w[0, 1]
-                    row[x + 2] += part * w[0, 2]
+        x, wx = _weigh(nodes[n, 0])
+        y, wy = _weigh(nodes[n, 1])
+        z, wz = _weigh(nodes[n, 2])
+        _add(target, width, height, (z * height + y) * width + x, (wx, wy, wz), values[n])
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _scatter_squares(layer, nodes, values):  # type: ignore[no-untyped-def]
+    """The same by the squares of the weights."""
+    height, width = layer.shape[1], layer.shape[2]
+    target = layer.ravel()
+    for n in range(len(nodes)):
+        x, (a0, a1, a2) = _weigh(nodes[n, 0])
+        y, (b0, b1, b2) = _weigh(nodes[n, 1])
+        z, (c0, c1, c2) = _weigh(nodes[n, 2])
+        squares = (
+            (a0 * a0, a1 * a1, a2 * a2),
+            (b0 * b0, b1 * b1, b2 * b2),
+            (c0 * c0, c1 * c1, c2 * c2),
+        )
+        _add(target, width, height, (z * height + y) * width + x, squares, values[n])

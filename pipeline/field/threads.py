@@ -40,5 +40,8 @@ def in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) -> 
         part(0, count)
         return
     edges = np.linspace(0, count, workers + 1).astype(int).tolist()
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(part, edges[:-1], edges[1:]))
+    with ThreadPoolExecutor(workers - 1) as pool:
+        others = pool.map(part, edges[1:-1], edges[2:])
+        # One thread that need not be started.
+        part(edges[0], edges[1])
+        list(others)
