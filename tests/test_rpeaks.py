@@ -86,6 +86,73 @@ def test_beats_are_found_again_after_all_leads_were_lost():
     assert not ((found_s > 12.2) & (found_s < 23.9)).any()
 
 
+SILENT = {
+    "nothing": lambda rng, signal: np.zeros_like(signal),
+    "last value": lambda rng, signal: np.repeat(signal[:1], len(signal), axis=0),
+    "missing": lambda rng, signal: np.full_like(signal, np.nan),
+    # An open input: the amplifier's own noise, a microvolt or so.
+    "amplifier": lambda rng, signal: 0.001 * rng.normal(size=signal.shape),
+}
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 500.0])
+@pytest.mark.parametrize("kind", SILENT)
+def test_silence_of_all_leads_is_noticed_at_any_moment_of_the_beat(kind, rate_hz):
+    rng = np.random.default_rng(3)
+    ecg = record(seed=4, duration_s=20.0, rate_hz=rate_hz)
+    for late_s in (0.0, 0.2, 0.4, 0.6):
+        signal_mv = ecg.signal_mv.copy()
+        first = round((12.0 + late_s) * rate_hz)
+        signal_mv[first:] = SILENT[kind](rng, signal_mv[first:])
+        detector = RPeakDetector(rate_hz, 3)
+        detector.push(signal_mv[:first])
+        assert detector.usable
+        # A window of 0.1 s, looked at every 5 ms or every sample.
+        detector.push(signal_mv[first : first + round(0.12 * rate_hz) + 1])
+        assert not detector.usable
+        detector.push(signal_mv[first + round(0.12 * rate_hz) + 1 :])
+        assert not detector.usable
+
+
+def usable_times(signal_mv, rate_hz):
+    detector = RPeakDetector(rate_hz, signal_mv.shape[1])
+    usable = []
+    for sample in signal_mv:
+        detector.push(sample)
+        usable.append(detector.usable)
+    return np.array(usable)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"muscle_mv": 0.0, "mains_mv": 0.0},
+        {"muscle_mv": 0.0, "mains_mv": 0.0, "baseline_mv": 0.0},
+        {"muscle_snr_db": 6.0, "magnetohydrodynamic_mv": 0.5},
+        {"baseline_mv": 2.0},
+        {"motion_per_minute": 20.0},
+    ],
+)
+@pytest.mark.parametrize("step_mv", [1e-6, 0.005, 0.02])
+def test_no_connected_lead_is_taken_for_a_lost_one(settings, step_mv):
+    """However clean, noisy or restless it is, and however coarse the converter."""
+    ecg = record(seed=5, duration_s=30.0, rr_s=1.2, **settings)
+    assert usable_times(step_mv * np.round(ecg.signal_mv / step_mv), 250.0).all()
+
+
+def test_a_lead_that_grows_quiet_is_believed_again_after_a_beat():
+    rng = np.random.default_rng(6)
+    ecg = record(seed=6, duration_s=20.0, muscle_mv=0.01, mains_mv=0.0)
+    signal_mv = ecg.signal_mv.copy()
+    # A tense muscle that relaxes at 12 s: noise falls to a tenth.
+    signal_mv[:3000] += 0.1 * rng.normal(size=signal_mv[:3000].shape)
+    usable = usable_times(signal_mv, 250.0)
+    assert usable[:3000].all()
+    # The next beat comes within 0.8 s, and a lead that comes back settles for 0.2 s.
+    assert usable[3000 + 300 :].all()
+
+
 def test_missing_samples_are_a_lost_lead():
     ecg = record()
     broken = ecg.signal_mv.copy()

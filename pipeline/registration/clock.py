@@ -136,6 +136,11 @@ class PhaseClock:
         """The RR interval that is expected now."""
         return float(self._state[ticks.RR])
 
+    @property
+    def tolerance_s(self) -> float:
+        """How far from the expected time a regular beat may come, before or after."""
+        return float(ticks.tolerance(self._state))
+
 
 def systole_s(rr_s: float) -> float:
     """Time from the R peak to the closure of the aortic valve in a beat of ``rr_s``.

@@ -13,7 +13,7 @@ from numba import config, njit
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_SOURCES = ("detector_state", "waves", "qrs", "ticks")
+_SOURCES = ("detector_state", "waves", "quality", "qrs", "ticks")
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

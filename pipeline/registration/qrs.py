@@ -28,7 +28,6 @@ from pipeline.registration.detector_state import (
     FOUND,
     HEIGHT,
     INTERVALS,
-    JUMPED,
     KEPT_INTERVALS,
     KEPT_WAVES,
     KNOWN,
@@ -43,13 +42,18 @@ from pipeline.registration.detector_state import (
     NOISE,
     RUN,
     SEEN,
-    SIZE,
     USABLE,
     USUAL_RR,
     WAITING,
     WEIGHT,
     Plan,
     State,
+)
+from pipeline.registration.quality import (
+    RUN_S,
+    SETTLE_S,
+    shows_nothing,
+    watch,
 )
 from pipeline.registration.waves import learn_beat, measure_beat
 
@@ -71,9 +75,6 @@ OVERDUE = 1.5
 """A beat is overdue after so many mean RR intervals."""
 KNOCK = 8.0
 """Energy, in units of a lead's beats, that no beat has."""
-RUN_S = 0.12
-"""A lead that repeats one value for so long shows nothing."""
-SETTLE_S = 0.2
 CLEAR, UNCLEAR = 3.5, 2.0
 """Beats have at least so many times the energy of what lies between them where they are plain to
 see; waves that have less than so many times are none, or not all of them."""
@@ -116,24 +117,11 @@ def _store(sample: Float, plan: Plan, s: State) -> None:
         if now == 0:
             s.raw[k, :] = value
         else:
-            _watch(lead, value, now, plan.rate_hz)
+            watch(lead, s.raw[k], value, now, plan)
         lead[LAST] = value
         s.raw[k, at] = value
         s.raw[k, at + length] = value
         _filter(k, now, plan, s)
-
-
-@compiled
-def _watch(lead: Float, value: float, now: int, rate_hz: float) -> None:
-    """Follow runs of one value. A run that begins or ends with a jump is a lead that came off."""
-    jumped = abs(value - lead[LAST]) > 0.1 * lead[SIZE]
-    if value == lead[LAST]:
-        lead[RUN] += 1
-        return
-    if lead[RUN] >= RUN_S * rate_hz and (jumped or lead[JUMPED] > 0.0):
-        lead[BAD_UNTIL] = now + SETTLE_S * rate_hz
-    lead[RUN] = 0
-    lead[JUMPED] = 1.0 if jumped else 0.0
 
 
 @compiled
@@ -239,7 +227,7 @@ def _height(i: int, plan: Plan, s: State) -> float:
         lead = s.leads[k]
         flat = lead[RUN] >= RUN_S * plan.rate_hz
         gone = now < lead[BAD_UNTIL]
-        usable = usable or not (gone or (flat and lead[JUMPED] > 0.0))
+        usable = usable or not shows_nothing(lead, now, plan.rate_hz)
         lead[WEIGHT] = 0.0
         if flat or gone or lead[LEVEL] <= 0.0:
             continue

@@ -68,7 +68,8 @@ class RPeakDetector:
     """Finds R peaks in samples as they come; memory and time for a sample are bounded.
 
     Leads may have either polarity and any gain and offset, and may come and go: a sample that is
-    not a number, a voltage that stays the same after a jump, and noise all take a lead's say.
+    not a number, a voltage that stays the same after a jump, less of a swing than the heart ever
+    lets it have (``quality``), and noise all take a lead's say.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ class RPeakDetector:
 
     @property
     def usable(self) -> bool:
-        """Whether some lead is connected, as of the last sample."""
+        """Whether some lead is connected, as of the last sample; not 0.1 s after all fell silent."""
         return bool(self._state.counters[at.USABLE])
 
     def _feed(self, block: Float) -> Float:
@@ -184,12 +185,14 @@ def _state(plan: Plan, leads: int) -> State:
     counters[at.USABLE] = 1
     numbers = np.zeros(at.NUMBERS)
     numbers[[at.BEST, at.LAST_HEIGHT, at.BETWEEN, at.USUAL_RR]] = -1, 1, 0.1, plan.rate_hz
+    rows = np.zeros((leads, at.LEAD_FIELDS))
+    rows[:, [at.SMALLEST_STEP, at.LOWEST, at.LOWEST_OLD, at.LOWEST_OLDER, at.STILLEST]] = np.inf
     return State(
         even, odd, _bell(_COARSE_S, plan.rate_hz), _bell(_FINE_S, plan.rate_hz),
         raw=np.zeros((leads, 2 * plan.length)), power=np.zeros((leads, 2 * plan.length)),
         energy=np.zeros((leads, plan.length)), fused=np.zeros(plan.length),
         waves=np.zeros((at.KEPT_WAVES, 2)), intervals=np.zeros(at.KEPT_INTERVALS),
-        leads=np.zeros((leads, at.LEAD_FIELDS)), shapes=np.zeros((leads, at.SHAPE_POINTS)),
+        leads=rows, shapes=np.zeros((leads, at.SHAPE_POINTS)),
         seen=np.zeros((leads, at.SHAPE_POINTS)),
         found=np.zeros((64, at.FIELDS)), counters=counters, numbers=numbers,
     )  # fmt: skip

@@ -16,8 +16,8 @@ from pipeline.registration.compiled import compiled
 R_AFTER_Q_S = 0.04
 SLOWEST_BPM, FASTEST_BPM = 45.0, 120.0
 KICK_S = 0.12
-LATENCY_S = 0.15
-"""An R peak is known at most so long after it."""
+LATENCY_S = 0.14
+"""An R peak is known about 0.132 s after it, 99 in 100 within this."""
 R_SD_S = 0.002
 KEPT = 16
 REGULAR_SHARE, MOST_SHARE = 0.10, 0.17

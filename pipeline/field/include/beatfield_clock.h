@@ -71,7 +71,8 @@ typedef struct {
 /* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. */
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
 
-/* An R peak became known, at the latest 0.15 s after it; strange: its shape is unlike the others'. */
+/* An R peak became known, as a rule within 0.14 s: the clock waits no longer for one that is due.
+ * strange: its shape is unlike the others'. */
 bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
 
 /* Phase now; usable: some lead is connected. Returns 0, or -1 when the time is no number or lies
@@ -98,7 +99,7 @@ extern "C" {
 #endif
 
 #define BFC_PI 3.14159265358979323846
-#define BFC_LATENCY_S 0.15
+#define BFC_LATENCY_S 0.14
 #define BFC_R_SD_S 0.002
 #define BFC_REGULAR 0.10
 #define BFC_MOST 0.17
