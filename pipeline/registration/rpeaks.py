@@ -114,7 +114,7 @@ class RPeakDetector:
 
     @property
     def usable(self) -> bool:
-        """Whether some lead is connected, as of the last sample; not 0.1 s after all fell silent."""
+        """Whether some lead is connected, by the last sample; not 0.1 s after all fell silent."""
         return bool(self._state.counters[at.USABLE])
 
     def _feed(self, block: Float) -> Float:
