@@ -1,24 +1,25 @@
 """Studies of tracked ultrasound with known truth, made one by one and kept on disk.
 
 Only what registration needs is made: the phantom's sweeps, their phases, and the moving surfaces,
-either the phantom's own or those that the pipeline found in the cine of the same seed.
+either the phantom's own or those that the pipeline found in the cine of the same seed. What takes
+long, the pictures of one heart by one probe, is made once; frames are left out of it, lost or
+drowned in noise afterwards.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_synth.echo import Optics
+from data_synth.echo import Optics, silence
 from data_synth.probe import EXAMINATIONS
 from data_synth.settings import PhantomSettings
 from data_synth.simulate import SWEEP_PAUSE_S, ULTRASOUND, ULTRASOUND_ECG, load_heart, record_ecg
 from data_synth.simulate import stream as stream_of
-from data_synth.ultrasound import Sweep, fitted_probe, simulate_sweeps
+from data_synth.ultrasound import fitted_probe, simulate_sweeps
 from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.products import read_surfaces, read_table
 
@@ -30,7 +31,8 @@ PATHOLOGIES = (
     "infarct",
     "enlarged_atrium",
 )
-SETUPS = tuple(EXAMINATIONS)
+SWEEPS, RECORDED = 2, 24
+"""How many sweeps are recorded, and frames in each."""
 TRUTH_PHASES = np.arange(20) / 20
 
 
@@ -51,26 +53,22 @@ class Order:
     """Level of muscle over added noise in the middle of the picture; None: the scanner's own."""
 
     @property
+    def recording(self) -> str:
+        """Name of the file of pictures it is drawn from."""
+        return f"{self.seed}-{self.pathology}-{self.probe}-{SWEEPS * RECORDED}-0-own"
+
+    @property
     def name(self) -> str:
-        """Of the file it is kept in."""
+        """Of the study."""
         noise = "own" if self.snr_db is None else f"{self.snr_db:g}"
         lost = round(100 * self.dropout)
         return f"{self.seed}-{self.pathology}-{self.probe}-{self.frames}-{lost}-{noise}"
 
     def settings(self) -> PhantomSettings:
         """Of the phantom."""
-        per_sweep = max(1, self.frames // 2)
+        ultrasound = {"probe": self.probe, "sweeps": SWEEPS, "frames": RECORDED}
         return PhantomSettings.model_validate(
-            {
-                "seed": self.seed,
-                "pathology": self.pathology,
-                "ultrasound": {
-                    "probe": self.probe,
-                    "frames": per_sweep,
-                    "lifted": float(self.dropout > 0),
-                    "lifted_frames": max(1, round(self.dropout * per_sweep)),
-                },
-            }
+            {"seed": self.seed, "pathology": self.pathology, "ultrasound": ultrasound}
         )
 
 
@@ -95,51 +93,70 @@ class Study:
 
 
 def make_study(order: Order, folder: Path) -> Study:
-    """The study of this order: from ``folder`` where it has been made before."""
-    path = folder / f"{order.name}.npz"
+    """The study of this order; its recording is kept in ``folder``."""
+    path = folder / f"{order.recording}.npz"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".partial.npz")
-        arrays: dict[str, Any] = _simulated(order)
+        arrays: dict[str, Any] = _simulated(order.settings())
         np.savez_compressed(partial, **arrays)
         partial.rename(path)
+    rng = np.random.default_rng([order.seed, 99])
+    chosen = np.linspace(0, RECORDED - 1, order.frames // SWEEPS).round().astype(np.int64)
+    sweeps, phases = [], []
     with np.load(path) as kept:
-        sweeps = [
-            TrackedSweep(
-                f"sweep_{k:03d}", kept[f"images_{k}"].astype(np.float32), kept[f"poses_{k}"]
-            )
-            for k in range(2)
-        ]
-        phases = [kept[f"phases_{k}"] for k in range(2)]
+        for k in range(SWEEPS):
+            images, poses = kept[f"images_{k}"], kept[f"poses_{k}"]
+            shown = worsened(rng, images, poses, chosen, order, k)
+            sweeps.append(TrackedSweep(f"sweep_{k:03d}", shown, poses[chosen]))
+            phases.append(kept[f"phases_{k}"][chosen])
         return Study(sweeps, phases, kept["mr_from_tracker"], kept["targets_mm"])
 
 
-def _simulated(order: Order) -> dict[str, np.ndarray]:
-    settings = order.settings()
+def _simulated(settings: PhantomSettings) -> dict[str, np.ndarray]:
     preset = settings.ultrasound
     heart = load_heart(settings)
     needed_s = preset.sweeps * (preset.frames / preset.frame_rate_hz + SWEEP_PAUSE_S)
     ecg = record_ecg(settings, ULTRASOUND_ECG, needed_s)
     sweeps = simulate_sweeps(stream_of(settings, ULTRASOUND), heart, ecg.r_times_s, preset)
-    rng = np.random.default_rng([order.seed, 99])
     kept: dict[str, np.ndarray] = {
         "mr_from_tracker": sweeps[0].mr_from_tracker,
         "targets_mm": heart.surfaces(0.0)["heart"][0],
-        "order": np.array(json.dumps(asdict(order))),
     }
     for k, sweep in enumerate(sweeps):
-        name = EXAMINATIONS[order.probe][k][0]
-        optics = fitted_probe(name, preset).optics
-        kept[f"images_{k}"] = noisier(rng, sweep, optics, order.snr_db)
+        kept[f"images_{k}"] = sweep.images
         kept[f"poses_{k}"] = sweep.probe_to_tracker @ sweep.image_to_probe
         kept[f"phases_{k}"] = sweep.nominal_phases % 1.0
     return kept
 
 
+def worsened(
+    rng: np.random.Generator,
+    images: np.ndarray,
+    poses: Float,
+    chosen: np.ndarray,
+    order: Order,
+    number: int,
+) -> Float32:
+    """The chosen pictures of sweep ``number``, with noise, some lost in one stretch."""
+    probe = fitted_probe(EXAMINATIONS[order.probe][number][0], order.settings().ultrasound)
+    pixel_mm = float(np.linalg.norm(poses[0, :3, 1]))
+    shown = noisier(rng, images, pixel_mm, probe.optics, order.snr_db)[chosen]
+    lost = round(order.dropout * len(chosen))
+    first = int(rng.integers(0, len(chosen) - lost + 1))
+    for k in range(first, first + lost):
+        shown[k] = silence(rng, probe.sector, probe.optics)
+    return shown.astype(np.float32)
+
+
 def noisier(
-    rng: np.random.Generator, sweep: Sweep, optics: Optics, snr_db: float | None
+    rng: np.random.Generator,
+    images: np.ndarray,
+    pixel_mm: float,
+    optics: Optics,
+    snr_db: float | None,
 ) -> np.ndarray:
-    """The sweep's pictures with an amplifier's noise on top of its own.
+    """A sweep's pictures with an amplifier's noise on top of its own.
 
     The grey values' compression is undone, a circular complex Gaussian is added to the amplitude
     (its level follows the gain over depth, so that it stands ``snr_db`` under muscle's nominal
@@ -147,21 +164,20 @@ def noisier(
     picture, but a circular sum does not depend on it.
     """
     if snr_db is None:
-        return sweep.images
+        return images
     muscle = 255 * optics.grey_of_muscle
-    sector = sweep.images.max(axis=0) > 0
-    pixel_mm = np.linalg.norm(sweep.image_to_probe[:3, 1])
+    sector = images.max(axis=0) > 0
     depth_cm = np.arange(sector.shape[0]) * pixel_mm / 10
     lift_db = optics.compensation * (depth_cm - depth_cm[len(depth_cm) // 2])
     noise = 10 ** ((np.minimum(lift_db, 30.0) - snr_db) / 20)[:, None]
-    images = []
-    for image in sweep.images.astype(float):
+    noisy = []
+    for image in images.astype(float):
         amplitude = 10 ** ((image - muscle) / 255 * optics.dynamic_range_db / 20)
         real, imaginary = rng.normal(scale=np.sqrt(0.5), size=(2, *image.shape)) * noise
         level_db = 20 * np.log10(np.hypot(amplitude + real, imaginary) + 1e-9)
         grey = muscle + 255 * level_db / optics.dynamic_range_db
-        images.append(np.where(sector, np.clip(grey, 0, 255).round(), 0).astype(np.uint8))
-    return np.stack(images)
+        noisy.append(np.where(sector, np.clip(grey, 0, 255).round(), 0).astype(np.uint8))
+    return np.stack(noisy)
 
 
 def true_surfaces(order: Order) -> dict[str, MovingSurface]:

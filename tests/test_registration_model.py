@@ -68,11 +68,22 @@ class TestCoverage:
         assert abs(share.sum(dtype=float) * spacing_mm**3 - surface.volume_mm3()) < tolerance
 
 
+def with_images(sweep, images):
+    return replace(sweep, images=images.astype(np.float32))
+
+
+def explained_of(sweeps, recording, tissue_map):
+    """``(frames,)`` explained share of each sweep at the true pose."""
+    samples = [sample_frames([one], recording.phases[:1], 4.0, 1.5, 20.0) for one in sweeps]
+    pose = recording.mr_from_tracker
+    return [agreement(one, tissue_map, pose).explained for one in samples]
+
+
 class TestAgreement:
     def test_explained_share_is_that_of_a_least_squares_fit(self, tissue_map, recording):
         """Against a general solver, with the model looked up by a general interpolator."""
         sweep, pose = recording.sweeps[0], recording.mr_from_tracker
-        samples = sample_frames([sweep], [np.full(len(sweep.images), PHASES[3])], 4.0, 1.5)
+        samples = sample_frames([sweep], [np.full(len(sweep.images), PHASES[3])], 4.0, 1.5, 20.0)
         grid = tissue_map.grid
         nodes = transform_points(pose, samples.points_mm.astype(float)) - grid.origin_mm
         nodes = (nodes / grid.spacing_mm).T[::-1]
@@ -81,7 +92,8 @@ class TestAgreement:
         found = agreement(samples, tissue_map, pose).explained
 
         for frame, (first, last) in enumerate(pairwise(samples.first)):
-            trend = samples.trend[first:last].astype(float)
+            row = samples.trend_row[frame]
+            trend = samples.trend[row : row + last - first].astype(float)
             grey = samples.grey[first:last].astype(float)
             shares = np.column_stack([share[first:last] for share in model])
             shares -= trend @ np.linalg.lstsq(trend, shares)[0]
@@ -94,42 +106,31 @@ class TestAgreement:
             assert explained - held_back - rounding < found[frame] < explained + rounding
 
     def test_agreement_is_best_at_the_true_pose(self, tissue_map, recording):
-        samples = sample_frames(recording.sweeps, recording.phases, 4.0, 1.5)
+        samples = sample_frames(recording.sweeps, recording.phases, 4.0, 1.5, 20.0)
         here = agreement(samples, tissue_map, recording.mr_from_tracker)
         for seed in range(6):
             off = start_off(recording, seed, 6, 6)
             assert agreement(samples, tissue_map, off).score < here.score
 
-    @given(
-        gain=st.floats(0.1, 10),
-        level=st.floats(0, 100),
-        tilt=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-0.003, 0.003)),
-    )
-    @settings(max_examples=10)
-    def test_gain_level_and_smooth_shading_do_not_matter(
-        self, tissue_map, recording, gain, level, tilt
-    ):
+    @pytest.mark.parametrize(("gain", "level"), [(0.1, 1.0), (10.0, 1.0), (1.0, 100.0)])
+    def test_gain_and_level_do_not_matter(self, tissue_map, recording, gain, level):
+        """Ranks do not change, but for ties that rounding makes or breaks."""
         sweep = recording.sweeps[0]
-        j, i = np.mgrid[: sweep.images.shape[1], : sweep.images.shape[2]]
-        shading = level + tilt[0] * i + tilt[1] * j + tilt[2] * i * j
-        # Lifted above 0, where a pixel would count as outside the sector.
-        shading -= shading.min() - 1
+        changed = np.where(sweep.images > 0, gain * sweep.images + level, 0)
+        before, after = explained_of((sweep, with_images(sweep, changed)), recording, tissue_map)
+        np.testing.assert_allclose(after, before, atol=2e-3)
+
+    def test_shading_across_the_sector_matters_little(self, tissue_map, recording):
+        """As much as the whole contrast from edge to edge, in half a wave: a column of the trend
+        but for its ranks, which are taken before. Without the trend nothing would be left."""
+        sweep = recording.sweeps[0]
         shown = sweep.images > 0
-        changed = replace(sweep, images=np.where(shown, gain * sweep.images + shading, 0))
-
-        before, after = (
-            agreement(
-                sample_frames([one], recording.phases[:1], 4.0, 1.5),
-                tissue_map,
-                recording.mr_from_tracker,
-            ).explained
-            for one in (sweep, changed)
-        )
-
-        # A Gaussian mean over a cut window follows a slope except at the sector's rim, where it
-        # shifts by about one smoothing length: half a grey value a mm, 1.5 mm, against a spread
-        # of some 20 grey values times the least gain.
-        np.testing.assert_allclose(after, before, atol=0.02 + 0.05 / gain)
+        width = sweep.images.shape[2]
+        wave = np.cos(np.pi * np.arange(width) / width)
+        shading = 2 * sweep.images[shown].std() * wave
+        changed = np.where(shown, sweep.images + shading - shading.min() + 1, 0)
+        before, after = explained_of((sweep, with_images(sweep, changed)), recording, tissue_map)
+        assert after.mean() > 0.8 * before.mean()
 
     def test_last_phase_flows_into_the_first(self, tissue_map, recording):
         """Half-way between the last stored phase and 1 lies half-way between last and first."""
@@ -138,7 +139,7 @@ class TestAgreement:
 
         def explained(phase: float, tissue: TissueMap) -> Float:
             phases = [np.full(len(sweep.images), phase)]
-            return agreement(sample_frames([sweep], phases, 4.0, 1.5), tissue, pose).explained
+            return agreement(sample_frames([sweep], phases, 4.0, 1.5, 20.0), tissue, pose).explained
 
         middle = replace(
             tissue_map,

@@ -1,114 +1,258 @@
-"""By how much the clock of the ultrasound lags that of the ECG, from how well frames fit.
+"""By how much the clock of the ultrasound is off that of the ECG, by the motion in its frames.
 
-Every frame is compared with the moving model at the phase that its time, shifted by a trial offset,
-has by the R peaks. The heart moves through each place twice a beat at different speeds, so one
-offset within a beat fits best: the agreement over offsets, averaged over frames, has its summit
-there. A sweep's own motion through the body is no matter, for frames are compared with the model
-where they lie, not with one another. How sure the summit is comes from resampling whole beats
-(B. Efron, "Bootstrap methods: another look at the jackknife", Ann Stat 7 (1979) 1-26), for frames
-of one beat err together.
+Frames are compared with the moving model where they lie, at the phases that their times, shifted by
+a trial offset, have by the R peaks. One offset within a beat fits best, for the heart moves through
+every place at its own times. The probe's own motion is no matter: frames are compared with the
+model, not with one another. A wrong offset also draws the pose a little, so the pose is sought anew
+at each offset: the summit is that of the profile. How sure it is comes from the frames' own slopes
+along that profile and from its bending (the sandwich of ``uncertainty``, in one dimension).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from pipeline.errors import InputError
 from pipeline.geometry import Float, Integer
+from pipeline.registration.frames import TrackedSweep
+from pipeline.registration.pose_search import Pivot, climb
+from pipeline.registration.search import Best, Level, Search
+from pipeline.registration.time import phases_at, summarise_rr
 
-LEAST_BEATS = 6
-"""Fewer beats say too little about how much they differ."""
-LARGEST_SD_S = 0.030
-"""An offset less sure than this is none: phases by it would be worse than by no correction."""
-_RESAMPLES = 200
-# The summit is that of a parabola through what lies this near.
-_NEAR_S = 0.060
+Choice = Literal["apply", "measure", "ignore"]
+
+LEAST_FRAMES = 20
+"""Fewer frames say too little about how much they differ."""
+LARGEST_SD_S = 0.020
+"""An offset less sure than this is none: phases by it could be worse than by no correction."""
+MODEL_SD_S = 0.005
+"""Standard deviation of what all frames share: phases of a cine are 20 to 40 ms apart, and the
+surfaces' motion is smoothed over more than that. No spread between frames shows it."""
+SIGNIFICANT = 3.0
+"""An offset of fewer standard deviations than this may be none."""
+# Trial offsets: fine enough not to step over a summit, which is some 100 ms wide.
+_SCAN_S = 0.020
+# Half the profile's width by which it is followed to its summit: more than half the time between
+# two phases of the model, between which motion is taken as even.
+_PROFILE_S = 0.025
+_ROUNDS = 4
+# Share of the best score that an offset elsewhere may reach; beyond, the frames do not tell which.
+_ELSEWHERE_S, _EQUAL_RIVAL = 0.100, 0.95
+# Up to which share of a sweep's frames neighbours count as correlated, as for the pose.
+_REACH = 0.25
+# Slope, in score a millimetre, at which a pose on the profile is taken for the best.
+_FLATNESS = 3e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """When frames were taken, on a clock that may be off that of the R peaks."""
+
+    times_s: Sequence[Float]
+    """For each sweep ``(n,)`` time stamps of its frames."""
+
+    r_times_s: Float
+    """``(beats,)`` rising R times."""
+
+    cycle_rr_s: float | None
+    """Length of the nominal beat; None where it is unknown."""
+
+    def phases(self, offset_s: float = 0.0) -> list[Float]:
+        """For each sweep the phases ``(n,)`` of its frames, whose clock is ahead by an offset.
+
+        Raises
+        ------
+        InputError
+            When frames lie more than a beat outside the R peaks.
+        """
+        return [
+            phases_at(times_s - offset_s, self.r_times_s, self.cycle_rr_s)
+            for times_s in self.times_s
+        ]
+
+    def at(self, number: Integer, offset_s: float) -> Float:
+        """Phases of frames, counted through all sweeps, at a trial offset.
+
+        A frame that the offset puts outside the R peaks stays at their end.
+        """
+        rr_s = summarise_rr(self.r_times_s).median_s
+        first, last = self.r_times_s[0] - 0.999 * rr_s, self.r_times_s[-1] + 0.999 * rr_s
+        times_s = np.concatenate(self.times_s)[number] - offset_s
+        return phases_at(np.clip(times_s, first, last), self.r_times_s, self.cycle_rr_s)
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """What to add to the times of frames to bring them to the clock of the ECG."""
+    """By how much the clock of the frames is ahead of that of the R peaks."""
 
     offset_s: float | None
-    """None where the frames do not tell: too few beats, no summit, or an unsure one."""
+    """Time stamp less time on the ECG's clock, within half a beat; None where the frames do not
+    tell: too few of them, two offsets that fit alike, or an unsure one."""
 
     sd_s: float
-    """Its standard deviation; infinite where there is no summit within the offsets tried."""
+    """Its standard deviation; infinite where there is no summit."""
+
+    mr_from_tracker: Float
+    """4x4, the pose that fits best at that offset; the one given where there is none."""
+
+    applied_s: float = 0.0
+    """What of it was taken off the frames' times: all or nothing."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether the clocks are apart beyond doubt."""
+        return self.offset_s is not None and abs(self.offset_s) > SIGNIFICANT * self.sd_s
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """A search on the clock of the ECG, as far as that is asked for."""
+
+    search: Search
+    best: Best
+    clock: ClockOffset | None
+    """None where it was not looked at."""
+
+
+def settle_clock(
+    search: Search,
+    best: Best,
+    sweeps: Sequence[TrackedSweep],
+    timing: Timing | None,
+    choice: Choice,
+) -> Settled:
+    """Estimate the offset and, where it is beyond doubt and so chosen, take it off.
+
+    Phases that are wrong by a quarter of a beat may have led the search astray, and then the offset
+    is wrong as well. So the pose is sought again at the phases that an offset gives, and the offset
+    estimated again there, until both agree; where they do not, there is none.
+
+    Parameters
+    ----------
+    search, best
+        The search at the phases of the times as they are, and what it found.
+    timing
+        None: there is nothing to settle.
+    choice
+        ``apply``: take it off; ``measure``: only say what it is; ``ignore``: do not look.
+    """
+    if timing is None or choice == "ignore":
+        return Settled(search, best, None)
+    level = search.fine_level(sweeps).thinned(search.settings.max_frames)
+    clock = estimate_offset(level, best.pose, search.pivot, timing)
+    if clock.offset_s is None or not clock.significant:
+        return Settled(search, best, clock)
+    for _ in range(_ROUNDS):
+        tried_s = clock.offset_s
+        there = replace(search, phases=timing.phases(tried_s))
+        found = there.best(sweeps)
+        clock = estimate_offset(level, found.pose, search.pivot, timing, tried_s)
+        if clock.offset_s is None:
+            break
+        if abs(clock.offset_s - tried_s) < 2 * clock.sd_s:
+            if choice == "measure" or not clock.significant:
+                return Settled(search, best, clock)
+            there = replace(search, phases=timing.phases(clock.offset_s))
+            return Settled(there, found, replace(clock, applied_s=clock.offset_s))
+    return Settled(search, best, ClockOffset(None, np.inf, best.pose))
 
 
 def estimate_offset(
-    offsets_s: Float, scores: Float, times_s: Float, r_times_s: Float, seed: int = 0
+    level: Level, pose: Float, pivot: Pivot, timing: Timing, tried_s: float = 0.0
 ) -> ClockOffset:
     """The offset at which frames fit the moving model best, and how sure it is.
 
     Parameters
     ----------
-    offsets_s
-        ``(k,)`` evenly spaced, rising trial offsets, seconds, seven or more; they should span no
-        more than one beat.
-    scores
-        ``(k, n)`` agreement of each frame with the model at each; more is better. Frames with a
-        score that is not a number do not count.
-    times_s
-        ``(n,)`` times of the frames, seconds.
-    r_times_s
-        ``(beats,)`` rising R times, which tell what frames belong to one beat.
-    seed
-        Of the resampling.
-
-    Raises
-    ------
-    InputError
-        When shapes do not fit, or offsets are few or uneven.
+    level
+        The frames, at any phases, and the model.
+    pose
+        4x4 ``mr_from_tracker``, the best at the phases that an offset of ``tried_s`` gives. One
+        that is wrong by a quarter of a beat draws it by some millimetres, which is near enough.
     """
-    _require(offsets_s, scores, times_s)
-    known = np.isfinite(scores).all(axis=0)
-    beat_of = np.searchsorted(r_times_s, times_s[known])
-    sums, counts = _per_beat(scores[:, known], beat_of)
-    if len(counts) < LEAST_BEATS:
-        return ClockOffset(None, np.inf)
-    best_s = _summit(offsets_s, sums.sum(axis=0) / counts.sum())
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(len(counts), size=(_RESAMPLES, len(counts)))
-    resampled = [_summit(offsets_s, sums[one].sum(axis=0) / counts[one].sum()) for one in drawn]
-    if best_s is None or None in resampled:
-        return ClockOffset(None, np.inf)
-    # Resampling finds the scatter of a mean of n beats too small by (n - 1) / n in its square.
-    widen = np.sqrt(len(counts) / (len(counts) - 1))
-    sd_s = float(np.std(np.array(resampled, dtype=float)) * widen)
-    return ClockOffset(best_s if sd_s <= LARGEST_SD_S else None, sd_s)
+    unknown = ClockOffset(None, np.inf, pose)
+    if level.samples.frames < LEAST_FRAMES:
+        return unknown
+    profile = _Profile(level, pivot, timing)
+    near = profile.nearest(pose, tried_s)
+    if near is None:
+        return unknown
+    offset_s, best = near
+    for _ in range(_ROUNDS):
+        summit = profile.summit(best, offset_s)
+        if summit is None:
+            return unknown
+        before_s, (offset_s, sd_s) = offset_s, summit
+        best = profile.climb(best, offset_s)
+        if abs(offset_s - before_s) < _SCAN_S / 2:
+            break
+    sd_s = float(np.hypot(sd_s, MODEL_SD_S))
+    return ClockOffset(offset_s, sd_s, best) if sd_s <= LARGEST_SD_S else unknown
 
 
-def _require(offsets_s: Float, scores: Float, times_s: Float) -> None:
-    if scores.shape != (len(offsets_s), len(times_s)):
-        raise InputError(
-            f"clock offset: scores of shape {scores.shape}; needs ({len(offsets_s)} offsets, "
-            f"{len(times_s)} frames)"
-        )
-    steps = np.diff(offsets_s)
-    if len(offsets_s) < 7 or not (steps > 0).all() or np.ptp(steps) > 1e-6 * steps.max():
-        raise InputError("clock offset: needs seven or more evenly spaced, rising offsets")
+@dataclass(frozen=True, slots=True)
+class _Profile:
+    """How well frames fit at any offset, at the pose that is best there."""
 
+    level: Level
+    pivot: Pivot
+    timing: Timing
 
-def _per_beat(scores: Float, beat_of: Integer) -> tuple[Float, Float]:
-    """``(beats, k)`` sums of the scores of each beat's frames, and ``(beats,)`` their number."""
-    beats, index = np.unique(beat_of, return_inverse=True)
-    sums = np.zeros((len(beats), len(scores)))
-    np.add.at(sums, index, scores.T)
-    return sums, np.bincount(index, minlength=len(beats)).astype(float)
+    def at(self, offset_s: float) -> Level:
+        """The frames at the phases that they have by an offset."""
+        samples = self.level.samples
+        phases = self.timing.at(samples.number, offset_s)
+        return replace(self.level, samples=replace(samples, phases=phases))
 
+    def climb(self, pose: Float, offset_s: float) -> Float:
+        """The best pose near one, at an offset."""
+        return climb(self.at(offset_s).score, pose, self.pivot, flatness=_FLATNESS)
 
-def _summit(offsets_s: Float, score: Float) -> float | None:
-    """Where a parabola about the highest score peaks; None at an end of the offsets tried."""
-    top = int(np.argmax(score))
-    near = np.abs(offsets_s - offsets_s[top]) <= max(_NEAR_S, 2.0 * (offsets_s[1] - offsets_s[0]))
-    if top in (0, len(offsets_s) - 1):
-        return None
-    x = offsets_s[near] - offsets_s[top]
-    bend, slope, _ = np.polyfit(x, score[near], 2)
-    if bend >= 0:
-        return None
-    shift_s = float(np.clip(-slope / (2 * bend), x[0], x[-1]))
-    return float(offsets_s[top]) + shift_s
+    def nearest(self, pose: Float, offset_s: float) -> tuple[float, Float] | None:
+        """The best of a row of offsets, and the pose there; None where two fit alike."""
+        for _ in range(_ROUNDS):
+            here_s, rival = self._scan(pose)
+            if abs(here_s - offset_s) <= _SCAN_S / 2:
+                break
+            offset_s, pose = here_s, self.climb(pose, here_s)
+        return (offset_s, pose) if rival <= _EQUAL_RIVAL else None
+
+    def _scan(self, pose: Float) -> tuple[float, float]:
+        """The best offset within half a beat to either side, at one pose; and the share of its
+        score that an offset elsewhere reaches."""
+        most = int(summarise_rr(self.timing.r_times_s).median_s / 2 / _SCAN_S)
+        offsets_s = _SCAN_S * np.arange(-most, most + 1)
+        scores = np.array([self.at(float(one)).score(pose) for one in offsets_s])
+        top = int(scores.argmax())
+        inner = np.r_[False, (scores[1:-1] >= scores[:-2]) & (scores[1:-1] >= scores[2:]), False]
+        far = inner & (np.abs(offsets_s - offsets_s[top]) > _ELSEWHERE_S)
+        return float(offsets_s[top]), float((scores[far] / scores[top]).max(initial=0.0))
+
+    def summit(self, pose: Float, offset_s: float) -> tuple[float, float] | None:
+        """Where the profile peaks near an offset, and the standard deviation of that place by the
+        frames' slopes; None where it does not bend down."""
+        offsets_s = (offset_s - _PROFILE_S, offset_s, offset_s + _PROFILE_S)
+        before, here, after = (self.at(one).losses(self.climb(pose, one)) for one in offsets_s)
+        slopes = (after - before) / (2 * _PROFILE_S)
+        bending = (before + after - 2 * here).sum() / _PROFILE_S**2
+        if bending <= 0:
+            return None
+        step_s = float(np.clip(-slopes.sum() / bending, -2 * _PROFILE_S, 2 * _PROFILE_S))
+        return offset_s + step_s, float(np.sqrt(self._spread(slopes)) / bending)
+
+    def _spread(self, slopes: Float) -> float:
+        """Variance of the sum of the frames' slopes; neighbours of one sweep err together, with
+        weights that fall linearly with the distance between them (Newey and West 1987)."""
+        ends = np.cumsum([len(times_s) for times_s in self.timing.times_s])
+        sweep = np.searchsorted(ends, self.level.samples.number, side="right")
+        away, total = slopes - slopes.mean(), 0.0
+        for number in np.unique(sweep):
+            own = away[sweep == number]
+            lags = min(len(own) - 1, max(1, round(_REACH * len(own))))
+            products = np.correlate(own, own, "full")[len(own) - 1 :][: lags + 1]
+            weights = 1 - np.arange(lags + 1) / (lags + 1)
+            total += products[0] + 2 * float(products[1:] @ weights[1:])
+        return max(total, float(away @ away))

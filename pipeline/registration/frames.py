@@ -9,12 +9,10 @@ from typing import Protocol
 import numpy as np
 from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.sparse import csr_array
+from scipy.stats import rankdata
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer, Mask
-
-TREND_COLUMNS = 6
-"""Polynomials of degree 2 in two coordinates."""
 
 
 class TrackedSweep(Protocol):
@@ -53,7 +51,7 @@ class Lattice:
     """``(samples, h * w)``: a Gaussian mean over the sector around each."""
 
     trend: Float
-    """``(samples, TREND_COLUMNS)``, orthonormal."""
+    """``(samples, columns)``, orthonormal: see `Samples`."""
 
     brightest: float
     """Largest grey value of the sweep."""
@@ -67,11 +65,14 @@ class Samples:
     """``(samples, 3)`` tracker millimetres."""
 
     grey: Float32
-    """``(samples,)``: of mean 0 in each frame, free of its trend, of variance 1."""
+    """``(samples,)``: ranks, of mean 0 in each frame, free of its trend, of variance 1."""
 
     trend: Float32
-    """``(samples, TREND_COLUMNS)``: orthonormal in each frame; what grey values may do for no
-    reason of the heart: gain, and shadow towards one side."""
+    """``(rows, columns)``: orthonormal in each frame, or 0 beyond its last column; what grey values
+    may do for no reason of the heart: gain, fading with depth, shadow, haze of what is bright."""
+
+    trend_row: Integer
+    """``(frames,)``: the row of ``trend`` for the frame's first sample; the others follow."""
 
     first: Integer
     """``(frames + 1,)``: frame k has the samples from ``first[k]`` up to ``first[k + 1]``."""
@@ -93,6 +94,7 @@ def sample_frames(
     phases: Sequence[Float],
     spacing_mm: float,
     smoothing_mm: float,
+    trend_mm: float,
 ) -> Samples:
     """Samples of every frame whose pose is known and whose picture is not flat.
 
@@ -104,6 +106,8 @@ def sample_frames(
         Distance between samples in the plane of a frame.
     smoothing_mm
         Standard deviation of the Gaussian that takes out speckle.
+    trend_mm
+        What changes over longer ways than this is trend, and is taken out.
 
     Raises
     ------
@@ -115,7 +119,7 @@ def sample_frames(
     offset = 0
     for sweep, own in zip(sweeps, phases, strict=True):
         _require_sweep(sweep, own)
-        part = _sample_sweep(sweep, own, spacing_mm, smoothing_mm)
+        part = _sample_sweep(sweep, own, spacing_mm, smoothing_mm, trend_mm)
         parts.append(replace(part, number=part.number + offset))
         offset += len(own)
     return _join(parts)
@@ -143,7 +147,8 @@ def choose(samples: Samples, frames: Integer) -> Samples:
     return Samples(
         samples.points_mm[rows],
         samples.grey[rows],
-        samples.trend[rows],
+        samples.trend,
+        samples.trend_row[frames],
         first,
         samples.phases[frames],
         samples.number[frames],
@@ -164,16 +169,20 @@ def _require_sweep(sweep: TrackedSweep, phases: Float) -> None:
 
 
 def _sample_sweep(
-    sweep: TrackedSweep, phases: Float, spacing_mm: float, smoothing_mm: float
+    sweep: TrackedSweep, phases: Float, spacing_mm: float, smoothing_mm: float, trend_mm: float
 ) -> Samples:
     """Samples of one sweep; its frames share the pixels that are looked at."""
-    lattice = lattice_of(sweep, spacing_mm, smoothing_mm)
+    lattice = lattice_of(sweep, spacing_mm, smoothing_mm, trend_mm)
     usable = np.asarray(np.isfinite(sweep.tracker_from_image).all(axis=(1, 2)))
     return sample_pictures(lattice, sweep.images, sweep.tracker_from_image, phases, usable)
 
 
-def lattice_of(sweep: TrackedSweep, spacing_mm: float, smoothing_mm: float) -> Lattice:
+def lattice_of(
+    sweep: TrackedSweep, spacing_mm: float, smoothing_mm: float, trend_mm: float
+) -> Lattice:
     """Where in the pictures of a sweep's geometry is looked, and how samples are taken there.
+
+    Lengths as for `sample_frames`.
 
     Raises
     ------
@@ -184,25 +193,32 @@ def lattice_of(sweep: TrackedSweep, spacing_mm: float, smoothing_mm: float) -> L
     sector = _sector(sweep)
     at = _lattice(sector, pixel_mm, spacing_mm)
     smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
-    return Lattice(at, smoothing, _trend(at * pixel_mm), float(sweep.images.max()))
+    trend = _trend(at * pixel_mm, trend_mm)
+    return Lattice(at, smoothing, trend, float(sweep.images.max()))
 
 
 def sample_pictures(
     lattice: Lattice, images: Float32, tracker_from_image: Float, phases: Float, usable: Mask
 ) -> Samples:
-    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that are not flat."""
+    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that are not flat.
+
+    A sample's grey value is its rank among the frame's: whatever the scanner's curve from echo to
+    grey, a few glaring mirrors count for no more than their number.
+    """
     seen = (lattice.smoothing @ images.reshape(len(images), -1).T).T
-    grey = seen - (seen @ lattice.trend) @ lattice.trend.T
-    spread = grey.std(axis=1)
     # A flat picture (the probe in air, a dead frame) has rounding errors for contrast.
-    lively = spread > 1e-3 * max(lattice.brightest, 1e-30)
+    lively = seen.std(axis=1) > 1e-3 * max(lattice.brightest, 1e-30)
     kept = np.flatnonzero(usable & lively)
+    rank = rankdata(seen[kept], axis=1) / len(lattice.at)
+    grey = rank - (rank @ lattice.trend) @ lattice.trend.T
+    spread = np.maximum(grey.std(axis=1), 1e-9)
     pixels = np.column_stack([lattice.at, np.zeros(len(lattice.at)), np.ones(len(lattice.at))])
     points = np.einsum("fij,sj->fsi", tracker_from_image[kept, :3], pixels)
     return Samples(
         points.reshape(-1, 3).astype(np.float32),
-        (grey[kept] / spread[kept, None]).reshape(-1).astype(np.float32),
-        np.tile(lattice.trend, (len(kept), 1)).astype(np.float32),
+        (grey / spread[:, None]).reshape(-1).astype(np.float32),
+        lattice.trend.astype(np.float32),
+        np.zeros(len(kept), dtype=np.int64),
         np.arange(len(kept) + 1) * len(lattice.at),
         phases[kept],
         kept,
@@ -267,21 +283,32 @@ def _smoothing(sector: Mask, at: Integer, pixel_mm: Float, sigma_mm: float) -> c
     return csr_array((weights[inside].astype(np.float32), (rows, columns)), shape=shape)
 
 
-def _trend(position_mm: Float) -> Float:
-    """Orthonormal columns that span the polynomials of degree 2 in the plane of the frame."""
+def _trend(position_mm: Float, shortest_mm: float) -> Float:
+    """Orthonormal columns that span the cosines in the plane of the frame that go from crest to
+    trough in no less than ``shortest_mm``."""
     size_mm = np.maximum(np.ptp(position_mm, axis=0), 1e-9)
-    x, y = ((position_mm - position_mm.mean(axis=0)) / size_mm).T
-    columns = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    return np.asarray(np.linalg.qr(columns)[0])
+    most = size_mm / shortest_mm
+    x, y = np.pi * ((position_mm - position_mm.min(axis=0)) / size_mm).T
+    columns = [
+        np.cos(i * x) * np.cos(j * y)
+        for i in range(int(most[0]) + 1)
+        for j in range(int(most[1]) + 1)
+        if np.hypot(i / most[0], j / most[1]) <= 1
+    ]
+    return np.asarray(np.linalg.qr(np.stack(columns, axis=1))[0])
 
 
 def _join(parts: Sequence[Samples]) -> Samples:
     """The samples of several sweeps, one after the other."""
     counts = np.concatenate([np.diff(part.first) for part in parts])
+    columns = max(part.trend.shape[1] for part in parts)
+    trends = [np.pad(p.trend, ((0, 0), (0, columns - p.trend.shape[1]))) for p in parts]
+    rows = np.cumsum([0, *(len(trend) for trend in trends[:-1])])
     return Samples(
         np.concatenate([part.points_mm for part in parts]),
         np.concatenate([part.grey for part in parts]),
-        np.concatenate([part.trend for part in parts]),
+        np.concatenate(trends),
+        np.concatenate([p.trend_row + row for p, row in zip(parts, rows, strict=True)]),
         np.concatenate([[0], np.cumsum(counts)]),
         np.concatenate([part.phases for part in parts]),
         np.concatenate([part.number for part in parts]),

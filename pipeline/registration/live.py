@@ -178,16 +178,14 @@ def prepare_follower(
     level = level.only(good).thinned(settings.max_frames)
 
     def losses(step_mm: Float) -> Float:
-        moved = search.pivot.move(pose, step_mm)
-        return np.log1p(-agreement(level.samples, level.tissue, moved).explained)
+        return level.losses(search.pivot.move(pose, step_mm))
 
     curvature = curvature_at(losses)
     ends = np.cumsum([len(sweep.images) for sweep in sweeps])
     spread = sandwich(curvature, np.searchsorted(ends, level.samples.number, side="right"))
     follower = Follower(search.fine, search.pivot, pose, information_of(spread, curvature.bending))
-    lattices = [
-        lattice_of(sweep, settings.sample_spacing_mm, settings.smoothing_mm) for sweep in sweeps
-    ]
+    lengths_mm = settings.sample_spacing_mm, settings.smoothing_mm, settings.trend_mm
+    lattices = [lattice_of(sweep, *lengths_mm) for sweep in sweeps]
     usual = float(np.median(1 - registered.residual[registered.valid]))
     scale = np.repeat([1.0, search.pivot.lever_mm], 3)
     covariance_mm2 = registered.covariance * np.outer(scale, scale)

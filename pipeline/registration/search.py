@@ -18,12 +18,14 @@ from pipeline.registration.pose_search import (
     poses_around,
 )
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.similarity import agreement
+from pipeline.registration.similarity import Agreement, agreement
 from pipeline.registration.tissue_map import TissueMap, blurred, cavities_of, draw_tissue
 
 # The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
 _COARSE_BLUR_MM = 5.0
 _COARSE_SPACING_MM = 9.0
+# From far away, whole chambers are to be found: only what is wider than they are is trend.
+_COARSE_TREND_MM = 60.0
 _COARSE_FRAMES = 24
 # Optima of the rough level that are told apart at the fine one, and by how many frames.
 _RIVALS = 3
@@ -40,10 +42,13 @@ class Level:
 
     samples: Samples
     tissue: TissueMap
+    shift_mm: Float | None = None
+    """``(frames, 3)``: how much further each frame lies in the model than its pose says."""
 
     def only(self, frames: Integer) -> Level:
         """With these frames (rising) alone."""
-        return Level(choose(self.samples, frames), self.tissue)
+        shift_mm = None if self.shift_mm is None else self.shift_mm[frames]
+        return Level(choose(self.samples, frames), self.tissue, shift_mm)
 
     def thinned(self, count: int) -> Level:
         """With at most ``count`` of the frames, evenly spread."""
@@ -52,9 +57,17 @@ class Level:
             return self
         return self.only(np.linspace(0, frames - 1, count).round().astype(np.int64))
 
+    def at(self, mr_from_tracker: Float) -> Agreement:
+        """Agreement of each frame at a pose."""
+        return agreement(self.samples, self.tissue, mr_from_tracker, self.shift_mm)
+
+    def losses(self, mr_from_tracker: Float) -> Float:
+        """``(frames,)`` log of the share of each frame that is left unexplained at a pose."""
+        return np.log1p(-self.at(mr_from_tracker).explained)
+
     def score(self, mr_from_tracker: Float) -> float:
         """Agreement of all frames at a pose."""
-        return agreement(self.samples, self.tissue, mr_from_tracker).score
+        return self.at(mr_from_tracker).score
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +97,15 @@ class Search:
 
     def coarse_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
         """Few frames, few samples, thick blur."""
-        samples = sample_frames(sweeps, self.phases, _COARSE_SPACING_MM, _COARSE_BLUR_MM)
+        lengths_mm = _COARSE_SPACING_MM, _COARSE_BLUR_MM, _COARSE_TREND_MM
+        samples = sample_frames(sweeps, self.phases, *lengths_mm)
         return Level(samples, self.coarse).thinned(_COARSE_FRAMES)
 
     def fine_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
         """All frames as the settings ask for them."""
         settings = self.settings
-        samples = sample_frames(
-            sweeps, self.phases, settings.sample_spacing_mm, settings.smoothing_mm
-        )
+        lengths_mm = settings.sample_spacing_mm, settings.smoothing_mm, settings.trend_mm
+        samples = sample_frames(sweeps, self.phases, *lengths_mm)
         return Level(samples, self.fine)
 
     def candidates(self, coarse: Level) -> list[Float]:

@@ -20,6 +20,9 @@ class RegisterSettings(BaseModel):
     """Distance between the pixels that are compared, in the plane of a frame."""
     smoothing_mm: float = Field(1.5, gt=0, le=10)
     """Standard deviation of the smoothing that takes out speckle; the model is blurred alike."""
+    trend_mm: float = Field(20.0, gt=0, le=200)
+    """What changes over longer ways than this, across a frame, is taken for gain, shadow and haze,
+    and is not looked at; three or more sample spacings."""
     grid_mm: float = Field(2.0, gt=0, le=5)
     """Node spacing of the grid on which the model's tissues are drawn."""
     capture_mm: float = Field(20.0, gt=0, le=60)
@@ -41,12 +44,19 @@ class RegisterSettings(BaseModel):
     model_error_mm: float = Field(0.5, ge=0, le=10)
     """Standard deviation of what all frames share, such as the surfaces' error: along each axis in
     shift, and about each axis at the heart's own radius. No spread between frames shows it."""
-    good_tre_mm: float = Field(1.2, gt=0)
+    good_tre_mm: float = Field(1.5, gt=0)
     """Expected error over the heart up to which a trusted registration is called good."""
     worst_tre_mm: float = Field(4.0, gt=0)
     """Expected error over the heart beyond which it is called failed."""
+    breath: Literal["hold", "free"] = "hold"
+    """Whether each sweep was recorded in a breath-hold, or in free breathing: then every frame's
+    own displacement along the breathing axis is found, and the pose is that of the heart at the
+    end of expiration."""
     accept: Literal["good", "doubtful"] = "doubtful"
     """The worst verdict that is let pass."""
+    clock_offset: Literal["apply", "measure", "ignore"] = "apply"
+    """What is done about an offset between the clocks of ultrasound and ECG: estimated from the
+    frames and taken off their times where it is beyond doubt, estimated only, or not looked at."""
     on_failure: Literal["stop", "mr_frame"] = "stop"
     """What happens to a study that cannot be registered: the stage fails, or the field is made in
     the frame of the MR."""
@@ -54,11 +64,16 @@ class RegisterSettings(BaseModel):
     """Of the poses that are tried around the start."""
 
     @model_validator(mode="after")
-    def _frames_in_order(self) -> Self:
+    def _consistent(self) -> Self:
         if self.max_frames < self.min_frames:
             raise ValueError(
                 f"max_frames = {self.max_frames} is under min_frames = {self.min_frames}; "
                 "raise max_frames or lower min_frames"
+            )
+        if self.trend_mm < 3 * self.sample_spacing_mm:
+            raise ValueError(
+                f"trend_mm = {self.trend_mm} is under three times sample_spacing_mm = "
+                f"{self.sample_spacing_mm}: little would be left to compare; raise trend_mm"
             )
         if self.worst_tre_mm < self.good_tre_mm:
             raise ValueError(

@@ -1,8 +1,10 @@
 """How well frames and model agree at a pose: the share of grey values that anatomy explains.
 
-The smoothed grey values of every frame are fitted by ``a + b * blood + c * wall`` and a smooth
+The smoothed grey values of every frame, as ranks, are fitted by ``a + b * blood + c * wall`` and a
 trend across the sector, so that no gain, no compression and no scanner needs to be known; what
-the fit explains beyond the trend is the frame's correlation ratio. After W. Wein et al.,
+the fit explains beyond the trend is the frame's correlation ratio. The trend takes in all that
+changes over centimetres: fading behind tissue, shadow, haze, and how bright what lies around the
+heart is. Left in, it draws the pose towards where it is strong. After W. Wein et al.,
 "Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention", Med
 Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 """
@@ -16,15 +18,12 @@ import numpy as np
 from numba import njit
 
 from pipeline.geometry import Float, Integer
-from pipeline.registration.frames import TREND_COLUMNS, Samples
+from pipeline.registration.frames import Samples
 from pipeline.registration.tissue_map import TissueMap
 
-# Per frame: grey with blood and wall (0, 1), the trend's columns with blood and with wall, blood
-# with itself, blood with wall, wall with itself, and the sum of blood and wall.
-_WITH_TREND = 2
-_SQUARES = _WITH_TREND + 2 * TREND_COLUMNS
-_IN_VIEW = _SQUARES + 3
-_SUMS = _IN_VIEW + 1
+# Per frame: grey with blood and with wall, blood with itself, blood with wall, wall with itself,
+# and the sum of blood and wall.
+_SUMS = 6
 # Grey values of variance 1 explained by less than this say nothing: it keeps the fit solvable
 # where a frame misses the heart.
 _RIDGE = 1e-3
@@ -47,25 +46,40 @@ class Agreement:
         return float(-np.log1p(-self.explained).mean())
 
 
-def agreement(samples: Samples, tissue: TissueMap, mr_from_tracker: Float) -> Agreement:
-    """Compare all frames with the model at one pose."""
+def agreement(
+    samples: Samples, tissue: TissueMap, mr_from_tracker: Float, shift_mm: Float | None = None
+) -> Agreement:
+    """Compare all frames with the model at one pose.
+
+    Parameters
+    ----------
+    mr_from_tracker
+        4x4.
+    shift_mm
+        ``(frames, 3)`` LPS: how much further each frame lies in the model; nothing if None.
+    """
     lower, weight = _neighbours(samples.phases, tissue.phases)
     index_from_mr = np.diag([*(1 / np.array(tissue.grid.spacing_mm)), 1.0])
     index_from_mr[:3, 3] = -np.array(tissue.grid.origin_mm) / tissue.grid.spacing_mm
+    shift = np.zeros((samples.frames, 3)) if shift_mm is None else shift_mm
     sums = np.zeros((samples.frames, _SUMS))
+    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
     _add_up(
         samples.points_mm,
         samples.grey,
         samples.trend,
+        samples.trend_row,
         samples.first,
         lower,
         weight,
         tissue.share,
         index_from_mr @ mr_from_tracker,
+        shift / np.array(tissue.grid.spacing_mm),
         sums,
+        with_trend,
     )
     counts = np.diff(samples.first)
-    return Agreement(_explained(sums, counts), sums[:, _IN_VIEW] / counts)
+    return Agreement(_explained(sums, with_trend, counts), sums[:, -1] / counts)
 
 
 def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
@@ -78,14 +92,14 @@ def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
     return (lower % len(stored)).astype(np.int64), weight
 
 
-def _explained(sums: Float, counts: Integer) -> Float:
+def _explained(sums: Float, with_trend: Float, counts: Integer) -> Float:
     """Variance explained by blood and walls beyond the trend, blood darker than the rest."""
     blood_grey, wall_grey = sums[:, 0], sums[:, 1]
-    trend_b, trend_w = np.split(sums[:, _WITH_TREND:_SQUARES], 2, axis=1)
+    trend_b, trend_w = with_trend[:, 0], with_trend[:, 1]
     ridge = _RIDGE * counts
-    bb = sums[:, _SQUARES] - (trend_b**2).sum(axis=1) + ridge
-    bw = sums[:, _SQUARES + 1] - (trend_b * trend_w).sum(axis=1)
-    ww = sums[:, _SQUARES + 2] - (trend_w**2).sum(axis=1) + ridge
+    bb = sums[:, 2] - (trend_b**2).sum(axis=1) + ridge
+    bw = sums[:, 3] - (trend_b * trend_w).sum(axis=1)
+    ww = sums[:, 4] - (trend_w**2).sum(axis=1) + ridge
     # Normal equations of two unknowns, solved by hand for all frames at once.
     determinant = bb * ww - bw**2
     blood = (ww * blood_grey - bw * wall_grey) / determinant
@@ -97,7 +111,20 @@ def _explained(sums: Float, counts: Integer) -> Float:
 
 
 @njit(cache=True, nogil=True)
-def _add_up(points, grey, trend, first, lower, weight, share, index_from_tracker, sums):  # type: ignore[no-untyped-def]
+def _add_up(  # type: ignore[no-untyped-def]
+    points,
+    grey,
+    trend,
+    trend_row,
+    first,
+    lower,
+    weight,
+    share,
+    index_from_tracker,
+    shift,
+    sums,
+    with_trend,
+):
     """Per frame: products of the shares with grey, trend and each other, and their own sum."""
     phases, depth, height, width, _ = share.shape
     m = index_from_tracker
@@ -105,9 +132,9 @@ def _add_up(points, grey, trend, first, lower, weight, share, index_from_tracker
         before, after, late = lower[f], (lower[f] + 1) % phases, weight[f]
         for s in range(first[f], first[f + 1]):
             px, py, pz = points[s, 0], points[s, 1], points[s, 2]
-            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
-            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
-            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[f, 0]
+            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[f, 1]
+            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[f, 2]
             i, j, k = math.floor(x), math.floor(y), math.floor(z)
             if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
                 u, v, w = np.float32(x - i), np.float32(y - j), np.float32(z - k)
@@ -115,7 +142,9 @@ def _add_up(points, grey, trend, first, lower, weight, share, index_from_tracker
                 blood_late, wall_late = _interpolate(share, after, k, j, i, w, v, u)
                 blood += late * (blood_late - blood)
                 wall += late * (wall_late - wall)
-                _accumulate(sums, f, blood, wall, grey[s], trend, s)
+                if blood > 0 or wall > 0:
+                    row = trend[trend_row[f] + s - first[f]]
+                    _accumulate(sums[f], with_trend[f], blood, wall, grey[s], row)
 
 
 @njit(cache=True, nogil=True)
@@ -135,14 +164,14 @@ def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(sums, f, blood, wall, grey, trend, s):  # type: ignore[no-untyped-def]
-    """Add one sample to the sums of frame ``f``."""
-    sums[f, 0] += blood * grey
-    sums[f, 1] += wall * grey
-    for c in range(TREND_COLUMNS):
-        sums[f, _WITH_TREND + c] += blood * trend[s, c]
-        sums[f, _WITH_TREND + TREND_COLUMNS + c] += wall * trend[s, c]
-    sums[f, _SQUARES] += blood * blood
-    sums[f, _SQUARES + 1] += blood * wall
-    sums[f, _SQUARES + 2] += wall * wall
-    sums[f, _IN_VIEW] += blood + wall
+def _accumulate(sums, with_trend, blood, wall, grey, trend):  # type: ignore[no-untyped-def]
+    """Add one sample to a frame's sums."""
+    sums[0] += blood * grey
+    sums[1] += wall * grey
+    sums[2] += blood * blood
+    sums[3] += blood * wall
+    sums[4] += wall * wall
+    sums[5] += blood + wall
+    for c in range(len(trend)):
+        with_trend[0, c] += blood * trend[c]
+        with_trend[1, c] += wall * trend[c]

@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import InputError, StageError
-from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
+from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
+from pipeline.registration.breathing import follow_breath
+from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.similarity import agreement
 from pipeline.registration.tissue_map import cavities_of
 from pipeline.registration.uncertainty import (
     curvature_at,
@@ -34,7 +35,7 @@ from pipeline.registration.verdict import Evidence, Grade, Verdict, judge
 _LEAST_IN_VIEW = 0.05
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
-_STEPS = 6
+_STEPS = 5
 # Points of the heart at which the expected error is looked at, of each surface.
 _POINTS = 200
 
@@ -65,6 +66,9 @@ class Registration:
     confidence: float
     """Score over the best that frames in the wrong place reach; 1 is chance."""
 
+    rival: float
+    """Share of the score that the best pose somewhere else reaches; 0 where none was met."""
+
     covariance: Float
     """``(6, 6)`` of the pose's error: shift along x, y, z (mm), then rotation vector (rad), in the
     MR frame, about ``centre_mm``."""
@@ -75,11 +79,18 @@ class Registration:
     expected_mm: float
     """Root mean square of the expected error over the heart."""
 
+    breath_mm: Float
+    """``(frames,)`` how far the heart has moved with breathing, along
+    `pipeline.registration.breathing.AXIS`; 0 where breath was held, or the frame is not used."""
+
     verdict: Grade
     """``good``, ``doubtful`` or ``failed``."""
 
     reason: str
     """Why it is not better; empty for a good one."""
+
+    clock: ClockOffset | None
+    """How far the clock of the frames is ahead of the ECG's; None where it was not asked for."""
 
     def expected_tre_mm(self, points_mm: Float) -> Float:
         """``(n,)`` root mean square target registration error to be expected at ``(n, 3)`` points
@@ -94,9 +105,11 @@ class _Found:
     pose: Float
     confidence: float
     rival: float
+    clock: ClockOffset | None
     everything: Level
+    breath_mm: Float
     bears_out: Mask
-    """Of the frames of ``everything``."""
+    """Of the frames of ``everything``, as those of ``breath_mm``."""
 
 
 def register(
@@ -106,6 +119,7 @@ def register(
     start: Float | None,
     settings: RegisterSettings | None = None,
     progress: Progress | None = None,
+    timing: Timing | None = None,
 ) -> Registration:
     """Find ``mr_from_tracker`` from tracked frames, their phases and the moving surfaces.
 
@@ -118,6 +132,9 @@ def register(
     start
         4x4 ``mr_from_tracker``, within the settings' capture range of the truth; None: the pose is
         sought anywhere, the heart somewhere in the middle of what the sweeps cover.
+    timing
+        What the phases were made from, for ``clock_offset`` of the settings: how far the frames'
+        clock is off the ECG's is estimated, and taken off where that is asked for. None: not.
 
     Raises
     ------
@@ -128,7 +145,7 @@ def register(
         When the verdict is worse than the settings accept.
     """
     settings = settings or RegisterSettings()
-    found = find(sweeps, phases, surfaces, start, settings, progress)
+    found = find(sweeps, phases, surfaces, start, settings, progress, timing)
     if found.verdict == "failed":
         raise StageError(found.reason)
     if found.verdict == "doubtful" and settings.accept == "good":
@@ -143,6 +160,7 @@ def find(
     start: Float | None,
     settings: RegisterSettings,
     progress: Progress | None = None,
+    timing: Timing | None = None,
 ) -> Registration:
     """As `register`, but a failed registration is returned with its verdict and its reason.
 
@@ -159,21 +177,20 @@ def find(
     tell(1, _STEPS)
     _require_heart_in_view(search.coarse_level(sweeps), search)
     best = search.best(sweeps)
+    settled = settle_clock(search, best, sweeps, timing, settings.clock_offset)
+    search, best = settled.search, settled.best
     tell(2, _STEPS)
-    # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
-    nearby = replace(search, start=best.pose) if start is None else search
-    chance = []
-    for step, displaced in enumerate((mirrored, backwards)):
-        chance.append(nearby.best([displaced(sweep) for sweep in sweeps]).score)
-        tell(3 + step, _STEPS)
+    chance = _by_chance(search, best.pose, sweeps)
+    tell(3, _STEPS)
     everything = search.fine_level(sweeps)
-    pose = _refined(everything, best.pose, search)
-    tell(5, _STEPS)
-    tiny = np.finfo(float).tiny
-    confidence, rival = best.score / max(*chance, tiny), best.rival / max(best.score, tiny)
-    bears_out = _bears_out(everything, pose, search.pivot)
-    found = _Found(pose, confidence, rival, everything, bears_out)
     sizes = [len(sweep.images) for sweep in sweeps]
+    pose = _refined(everything, best.pose, search)
+    everything, pose, breath_mm = _breathing(everything, pose, search, sizes)
+    tell(4, _STEPS)
+    tiny = np.finfo(float).tiny
+    confidence, rival = best.score / max(chance, tiny), best.rival / max(best.score, tiny)
+    bears_out = _bears_out(everything, pose, search.pivot)
+    found = _Found(pose, confidence, rival, settled.clock, everything, breath_mm, bears_out)
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -198,16 +215,23 @@ def _require_heart_in_view(level: Level, search: Search) -> None:
     """Refuse frames that miss the heart wherever the tracker may stand."""
     if search.start is None:
         return
-    seen = max(
-        (agreement(level.samples, level.tissue, pose).in_view > _LEAST_IN_VIEW).sum()
-        for pose in search.candidates(level)
-    )
+    seen = max((level.at(pose).in_view > _LEAST_IN_VIEW).sum() for pose in search.candidates(level))
     if seen < min(search.settings.min_frames, level.samples.frames) or seen == 0:
         raise InputError(
             f"of {level.samples.frames} frames looked at, {seen} or fewer cross the heart at every "
             f"pose within {search.settings.capture_mm:g} mm and {search.settings.capture_deg:g} "
             "degrees of the start; is initial_mr_from_tracker right, in the direction of its name?"
         )
+
+
+def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> float:
+    """The best score that frames in the wrong place reach."""
+    # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
+    nearby = replace(search, start=pose) if search.start is None else search
+    return max(
+        nearby.best([displaced(sweep) for sweep in sweeps]).score
+        for displaced in (mirrored, backwards)
+    )
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:
@@ -221,12 +245,10 @@ def _refined(everything: Level, pose: Float, search: Search) -> Float:
 
 def _bears_out(level: Level, pose: Float, pivot: Pivot) -> Mask:
     """Which frames meet the heart, agree as others do, and better here than at poses nearby."""
-    here = agreement(level.samples, level.tissue, pose)
+    here = level.at(pose)
     # Far enough to leave the optimum, near enough to see the same parts.
     steps = 12.0 * np.concatenate([np.eye(6), -np.eye(6)])
-    nearby = [
-        agreement(level.samples, level.tissue, pivot.move(pose, step)).explained for step in steps
-    ]
+    nearby = [level.at(pivot.move(pose, step)).explained for step in steps]
     usual = here.explained > _LEAST_OF_USUAL * np.median(here.explained)
     peak = here.explained > np.quantile(nearby, 0.75, axis=0)
     return np.asarray((here.in_view > _LEAST_IN_VIEW) & usual & peak)
@@ -237,19 +259,30 @@ def _some(points_mm: Float) -> Float:
     return points_mm[:: max(1, len(points_mm) // _POINTS)]
 
 
+def _breathing(
+    level: Level, pose: Float, search: Search, sizes: Sequence[int]
+) -> tuple[Level, Float, Float]:
+    """Frames, pose and each frame's displacement along the breathing axis, if breath was free."""
+    if search.settings.breath == "hold":
+        return level, pose, np.zeros(level.samples.frames)
+    sweep = _sweep_of(level, sizes)
+    placed, pose, breath_mm = follow_breath(level, pose, search.pivot, sweep)
+    return placed, _refined(placed, pose, search), breath_mm
+
+
+def _sweep_of(level: Level, sizes: Sequence[int]) -> Integer:
+    """``(frames,)`` number of each frame's sweep."""
+    return np.searchsorted(np.cumsum(sizes), level.samples.number, side="right")
+
+
 def _covariance(found: _Found, search: Search, sizes: Sequence[int]) -> Float:
     """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor."""
     judged = found.everything
     if found.bears_out.sum() >= search.settings.min_frames:
         judged = judged.only(np.flatnonzero(found.bears_out))
     judged = judged.thinned(search.settings.max_frames)
-
-    def losses(step_mm: Float) -> Float:
-        pose = search.pivot.move(found.pose, step_mm)
-        return np.log1p(-agreement(judged.samples, judged.tissue, pose).explained)
-
-    sweep = np.searchsorted(np.cumsum(sizes), judged.samples.number, side="right")
-    spread = in_radians(sandwich(curvature_at(losses), sweep), search.pivot)
+    curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
+    spread = in_radians(sandwich(curvature, _sweep_of(judged, sizes)), search.pivot)
     return np.asarray(spread + floor_of(search.settings.model_error_mm, search.pivot))
 
 
@@ -264,9 +297,11 @@ def _summarise(
     verdict = _verdict(found, search, frames, float(np.sqrt((expected**2).mean())))
     judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
     residual = np.ones(frames)
-    residual[level.samples.number] = 1 - agreement(level.samples, level.tissue, pose).explained
+    residual[level.samples.number] = 1 - level.at(pose).explained
     valid = np.zeros(frames, dtype=bool)
     valid[level.samples.number] = found.bears_out
+    breath_mm = np.zeros(frames)
+    breath_mm[level.samples.number] = found.breath_mm
     return Registration(
         mr_from_tracker=pose,
         residual=residual,
@@ -274,11 +309,14 @@ def _summarise(
         score=judged.score(pose),
         start_score=0.0 if search.start is None else judged.score(search.start),
         confidence=found.confidence,
+        rival=found.rival,
         covariance=covariance,
         centre_mm=pivot.centre_mm,
         expected_mm=float(np.sqrt((expected**2).mean())),
+        breath_mm=breath_mm,
         verdict=verdict.grade,
         reason=verdict.reason,
+        clock=found.clock,
     )
 
 

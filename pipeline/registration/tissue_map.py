@@ -85,10 +85,19 @@ def cavities_of(surfaces: Mapping[str, MovingSurface]) -> list[MovingSurface]:
 
 
 def blurred(tissue: TissueMap, sigma_mm: float) -> TissueMap:
-    """The map seen through a Gaussian of standard deviation ``sigma_mm``."""
-    sigma = sigma_mm / np.array(tissue.grid.spacing_mm[::-1])
+    """The map seen through a Gaussian of standard deviation ``sigma_mm``.
+
+    Nodes closer together than 0.8 of it are thinned: straight lines between nodes so far apart are
+    off by 2 % of a step from blood to wall at most, and what stays fits the processor's cache.
+    """
+    grid = tissue.grid
+    sigma = sigma_mm / np.array(grid.spacing_mm[::-1])
     share = gaussian_filter(tissue.share, (0, *sigma, 0), mode="constant", truncate=3)
-    return TissueMap(share, tissue.phases, tissue.grid)
+    every = max(1, int(0.8 * sigma.min()))
+    kept = np.ascontiguousarray(share[:, ::every, ::every, ::every])
+    x_mm, y_mm, z_mm = (every * length_mm for length_mm in grid.spacing_mm)
+    coarser = Grid(kept.shape[1:4], grid.origin_mm, (x_mm, y_mm, z_mm))
+    return TissueMap(kept, tissue.phases, coarser)
 
 
 def coverage(surface: Surface, grid: Grid) -> Float32:

@@ -12,8 +12,9 @@ from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, read_sweep
 from pipeline.job import Job, Skipped
 from pipeline.products import FrameRow, read_surfaces, read_table, write_frames, write_table
+from pipeline.registration.clock_offset import Timing
 from pipeline.registration.space import Registration, register
-from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
+from pipeline.registration.time import detect_r_peaks, summarise_rr
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -23,11 +24,11 @@ def run(job: Job) -> dict[str, Any]:
     start = _start(job)
     sweeps = [read_sweep(path) for path in job.study.us.sweeps]
     r_times_s = _r_times_s(job)
-    timing = read_table(job.products / "ingest" / "phases.json")
-    cycle, cycle_rr_s = np.array(timing["phases"]), timing.get("rr_s")
-    phases = [phases_at(sweep.times_s, r_times_s, cycle_rr_s) for sweep in sweeps]
-    surfaces = read_surfaces(job.products / "surface", cycle)
-    found = _registered(job, sweeps, phases, surfaces, start)
+    cycle = read_table(job.products / "ingest" / "phases.json")
+    surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
+    timing = Timing([sweep.times_s for sweep in sweeps], r_times_s, cycle.get("rr_s"))
+    found = _registered(job, sweeps, timing, surfaces, start)
+    phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found))
     return {
         "frames": len(found.valid),
@@ -38,7 +39,9 @@ def run(job: Job) -> dict[str, Any]:
         "verdict": found.verdict,
         "reason": found.reason,
         "expected_tre_mm": round(found.expected_mm, 3),
+        "breath_range_mm": round(float(np.ptp(found.breath_mm)), 2),
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
+        **_clock_figures(found),
     }
 
 
@@ -56,14 +59,14 @@ def _start(job: Job) -> Float | None:
 def _registered(
     job: Job,
     sweeps: list[Sweep],
-    phases: list[Float],
+    timing: Timing,
     surfaces: dict[str, MovingSurface],
     start: Float | None,
 ) -> Registration:
     """The registration; where there is none and the user wants it so, the MR's frame."""
-    settings = job.settings.register_
+    settings, phases = job.settings.register_, timing.phases()
     try:
-        return register(sweeps, phases, surfaces, start, settings, job.progress)
+        return register(sweeps, phases, surfaces, start, settings, job.progress, timing)
     except StageError as error:
         if settings.on_failure == "stop":
             raise
@@ -88,6 +91,19 @@ def _rows(sweeps: list[Sweep], phases: list[Float], found: Registration) -> list
     ]
 
 
+def _clock_figures(found: Registration) -> dict[str, float | None]:
+    """How far the ultrasound's clock is ahead of the ECG's (None: not asked for, or the frames do
+    not tell), its standard deviation, and what of it was taken off."""
+    clock = found.clock
+    if clock is None or clock.offset_s is None:
+        return {"us_clock_offset_s": None, "us_clock_offset_sd_s": None, "us_clock_applied_s": 0.0}
+    return {
+        "us_clock_offset_s": round(clock.offset_s, 4),
+        "us_clock_offset_sd_s": round(clock.sd_s, 4),
+        "us_clock_applied_s": round(clock.applied_s, 4),
+    }
+
+
 def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
     write_table(
         job.folder / "mr_from_tracker.json",
@@ -101,6 +117,7 @@ def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
             "expected_tre_mm": round(found.expected_mm, 3),
             "verdict": found.verdict,
             "reason": found.reason,
+            **_clock_figures(found),
         },
     )
     write_frames(job.folder / "frames.csv", rows)

@@ -14,11 +14,12 @@ from pipeline.imaging.ultrasound import read_sweep
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.publish import sealed
-from pipeline.report import heart, pictures
+from pipeline.registration.uncertainty import expected_tre_mm
+from pipeline.report import certainty, heart, pictures
 from pipeline.report.moments import Moments
 from pipeline.report.page import Section, Table, figure_row, is_single, picture, render
 from pipeline.report.slices import lowest_place
-from pipeline.report.style import as_png, as_svg
+from pipeline.report.style import as_png, as_svg, as_webp
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -123,7 +124,9 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     folder = job.product("register")
     if folder is None or job.study.us is None:
         return []
-    mr_from_tracker = np.array(read_table(folder / "mr_from_tracker.json")["mr_from_tracker"])
+    found = read_table(folder / "mr_from_tracker.json")
+    mr_from_tracker = np.array(found["mr_from_tracker"])
+    covariance, centre_mm = np.array(found["covariance"]), np.array(found["centre_mm"])
     rows = [row for row in read_frames(folder / "frames.csv") if row.valid]
     chosen = [rows[k] for k in np.linspace(0, len(rows) - 1, ULTRASOUND_FRAMES_SHOWN).astype(int)]
     sweeps = {path.stem: read_sweep(path) for path in job.study.us.sweeps}
@@ -138,12 +141,23 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     figure = pictures.cuts_on_ultrasound(
         images, image_from_mr, np.array([row.phase for row in chosen]), surfaces
     )
+    heart_in_mm = certainty.expected_error(
+        surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
+    )
     return [
         Section(
             "Registration",
             "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
-            "phase of the heartbeat. Where the lines follow the walls, the registration holds.",
-            [picture("Ultrasound with the registered surfaces", as_png(figure), "png")],
+            "phase of the heartbeat. Where the lines follow the walls, the registration holds. "
+            "Beside them, how far off it is to be expected at each place of the heart.",
+            [
+                picture("Ultrasound with the registered surfaces", as_png(figure), "png"),
+                picture(
+                    "Expected registration error over the heart, root mean square",
+                    as_webp(heart_in_mm, 110),
+                    "webp",
+                ),
+            ],
         )
     ]
 

@@ -1,0 +1,75 @@
+"""The heart coloured by how far the registration may be off at each place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from pipeline.geometry import Float, Integer, MovingSurface
+from pipeline.report.animation import COLOURS, HEAD, TOWARDS_VIEWER
+
+# Light from the viewer; what turns away keeps this much of it, so that colours can be read.
+_LEAST_LIGHT = 0.7
+_VIEWS = (("from the front left", 1.0), ("from behind on the right", -1.0))
+
+ErrorAt = Callable[[Float], Float]
+"""``(n,)`` mm to be expected at ``(n, 3)`` points, LPS mm."""
+
+
+def expected_error(surfaces: Mapping[str, MovingSurface], error_mm: ErrorAt) -> Figure:
+    """The heart's outer surfaces in the first phase from two sides, coloured by ``error_mm``."""
+    corners = np.concatenate(
+        [
+            surfaces[name].at(0).vertices_mm[surfaces[name].triangles]
+            for name in COLOURS
+            if name in surfaces
+        ]
+    )
+    value = error_mm(corners.mean(axis=1))
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    for axis, (title, sign) in zip(figure.subplots(1, 2), _VIEWS, strict=True):
+        facing, shape, light = seen_from(corners, sign * TOWARDS_VIEWER)
+        painted = PolyCollection(list(shape), cmap="viridis", linewidths=0.3)
+        painted.set_clim(value.min(), max(value.max(), value.min() + 0.1))
+        colours = painted.to_rgba(value[facing])
+        colours[:, :3] *= light[:, None]
+        painted.set(facecolors=colours, edgecolors=colours)
+        axis.add_collection(painted)
+        axis.autoscale_view()
+        axis.set_aspect("equal")
+        axis.set_axis_off()
+        axis.set_title(title, fontsize=9)
+    figure.colorbar(painted, ax=figure.axes, label="expected error (mm)", shrink=0.8)
+    return figure
+
+
+def seen_from(corners_mm: Float, towards_viewer: Float) -> tuple[Integer, Float, Float]:
+    """The triangles that face a far viewer, the farthest first.
+
+    Parameters
+    ----------
+    corners_mm
+        ``(n, 3, 3)`` corners of outward triangles.
+    towards_viewer
+        ``(3,)`` direction, of any length.
+
+    Returns
+    -------
+    Their numbers ``(k,)``, corners ``(k, 3, 2)`` to the right and up in mm, and light ``(k,)``, 1
+    where a triangle faces the viewer squarely.
+    """
+    towards = towards_viewer / np.linalg.norm(towards_viewer)
+    right = np.cross(HEAD, towards)
+    right /= np.linalg.norm(right)
+    up = np.cross(towards, right)
+    normal = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
+    squareness = normal @ towards / length
+    facing = np.flatnonzero(squareness > 0)
+    depth = corners_mm[facing].mean(axis=1) @ towards
+    facing = facing[np.argsort(depth, kind="stable")]
+    light = _LEAST_LIGHT + (1 - _LEAST_LIGHT) * squareness[facing]
+    return facing, corners_mm[facing] @ np.stack([right, up], axis=1), light

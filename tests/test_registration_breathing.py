@@ -1,0 +1,81 @@
+"""Displacement of the heart with breathing, frame by frame, from the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ellipsoid_heart import moving_surfaces, record, target_error_mm
+
+from pipeline.registration.breathing import AXIS, likeliest_way_mm
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.space import find
+
+QUICK = RegisterSettings(grid_mm=3.0, sample_spacing_mm=6.0, candidates=1, starts=1, max_frames=30)
+FRAMES = 40
+DEPTH_MM = 7.0
+
+
+def total_cost(costs, way):
+    """Of places by number, by the model's own definition."""
+    places_mm = np.arange(-12, 12.125, 0.25)[np.asarray(way)]
+    own = sum(cost[k] for cost, k in zip(costs, way, strict=True))
+    steps = (np.diff(places_mm, axis=0) / 0.5) ** 2
+    return own + 0.5 * steps.sum(axis=0) + 0.5 * ((places_mm / 6.0) ** 2).sum(axis=0)
+
+
+def test_the_likeliest_way_is_that_of_all_ways_that_costs_least():
+    """Every way of three frames through 97 places is tried: 912673 of them."""
+    rng = np.random.default_rng(1)
+    costs = rng.uniform(0, 200, (3, 97))
+    ways = np.indices((97, 97, 97)).reshape(3, -1)
+    best = ways[:, total_cost(costs, ways).argmin()]
+    np.testing.assert_allclose(likeliest_way_mm(costs), np.arange(-12, 12.125, 0.25)[best])
+
+
+def test_frames_that_say_nothing_stay_at_rest():
+    np.testing.assert_array_equal(likeliest_way_mm(np.zeros((5, 97))), 0.0)
+
+
+@pytest.fixture(scope="module")
+def breathing():
+    """Sweeps of one breath each, 7 mm deep, at rest at the end of expiration for a third of it.
+
+    Pictures are drawn of a heart at rest; that each was taken when the heart lay ``depth_mm``
+    along the axis is the same as that the probe was that much further when it was drawn.
+    """
+    recording = record(seed=3, frames=FRAMES)
+    truth = recording.mr_from_tracker
+    sweeps, depths = [], []
+    for number, sweep in enumerate(recording.sweeps):
+        turns = (np.arange(FRAMES) + 15 * number) / FRAMES
+        depth_mm = DEPTH_MM * np.sin(np.pi * turns) ** 4
+        moved = np.tile(np.eye(4), (FRAMES, 1, 1))
+        moved[:, :3, 3] = depth_mm[:, None] * AXIS
+        poses = np.linalg.inv(truth) @ moved @ truth @ sweep.tracker_from_image
+        sweeps.append(replace(sweep, tracker_from_image=poses))
+        depths.append(depth_mm)
+    return sweeps, recording.phases, truth, np.concatenate(depths)
+
+
+def test_breath_is_followed_and_the_pose_is_that_of_rest(breathing):
+    sweeps, phases, truth, depth_mm = breathing
+    surfaces = moving_surfaces()
+    points = surfaces["lv_endocardium"].vertices_mm[0]
+    found = {}
+    for breath in ("hold", "free"):
+        settings = QUICK.model_copy(update={"breath": breath})
+        found[breath] = find(sweeps, phases, surfaces, truth, settings)
+    error_mm = {
+        breath: target_error_mm(one.mr_from_tracker, truth, points).mean()
+        for breath, one in found.items()
+    }
+    # As if held, the pose is pulled away from rest, by up to the mean of a breath: 3/8 of 7 mm.
+    assert error_mm["hold"] > 1.0
+    assert error_mm["free"] < 2 / 3 * error_mm["hold"]
+    assert not found["hold"].breath_mm.any()
+    left_mm = found["free"].breath_mm - depth_mm
+    assert left_mm.std() < 0.5 * depth_mm.std()
+    assert abs(left_mm.mean()) < 1.0
+    assert found["free"].score > found["hold"].score
