@@ -284,8 +284,10 @@ def _acquired(
     half = len(value) // 4
     spectrum = np.fft.fftshift(np.fft.fft2(value))[half:-half, half:-half] / 4
     # The window's edge is soft, as scanners filter it; the rest of k-space is filled with zeros.
-    k = np.abs(np.arange(-half, half) / half)
-    window = np.clip((look.sharp + 0.15 - k) / 0.3, 0, 1)
+    k = np.arange(-half, half) / half
+    window = np.clip((look.sharp + 0.15 - np.abs(k)) / 0.3, 0, 1)
+    # A pixel lies in the middle of its two points: half a point, a quarter pixel, from the first.
+    window = window * np.exp(0.25j * np.pi * k)
     image = np.fft.ifft2(np.fft.ifftshift(spectrum * window[:, None] * window))
     image = image * _shading(look, points, scan)
     deviation = abs(look.signal[Stuff.LV_BLOOD, len(OFF_HZ) // 2]) / scan.snr

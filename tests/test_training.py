@@ -304,3 +304,7 @@ def test_command_line_leaves_a_network(tmp_path, capsys):
     assert main(arguments) == 0
     assert (tmp_path / "heart.onnx").stat().st_size > 1e6
     assert "pool: 1 of 1 hearts" in capsys.readouterr().out
+    # Without hearts of its own seed, those of another are learned from.
+    others = ["--hearts", "0", "--seed", "5", "--more", "0", "1", "--steps", "1", "--batch", "2"]
+    assert main(["--out", str(tmp_path / "on"), "--pool", str(tmp_path / "pool"), *others]) == 0
+    assert (tmp_path / "on" / "heart.onnx").exists()

@@ -20,7 +20,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
-    paths = fill_pool(options.pool or options.out / "pool", pool, _say_pool, options.workers)
+    folder = options.pool or options.out / "pool"
+    paths = fill_pool(folder, pool, _say_pool, options.workers)
+    for seed, hearts in options.more:
+        others = PoolSettings(hearts=hearts, spread=options.spread, seed=seed)
+        paths += fill_pool(folder, others, _say_pool, options.workers)
     if options.pool_only:
         return 0
     blocks = [block for path in paths for block in np.load(path)]
@@ -51,6 +55,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m data_synth.training", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of pool and network")
     parser.add_argument("--hearts", type=int, default=240, help="hearts in the pool")
+    parser.add_argument(
+        "--more", action="append", default=[], nargs=2, type=int, metavar=("SEED", "HEARTS"),
+        help="hearts of another seed besides",
+    )  # fmt: skip
     parser.add_argument("--spread", type=float, default=1.6, help="how far hearts are from mean")
     parser.add_argument("--steps", type=int, default=16_000, help="batches to learn from")
     parser.add_argument("--batch", type=int, default=8, help="images in a batch")

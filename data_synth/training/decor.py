@@ -25,7 +25,9 @@ class Decor:
     smooth one that a reader draws.
     """
 
-    def __init__(self, rng: np.random.Generator, side: int, rims: bool, fat: bool) -> None:
+    def __init__(
+        self, rng: np.random.Generator, side: int, rims: bool, fat: bool, fine: bool = True
+    ) -> None:
         self.fine = smooth_noise(rng, side, side // int(rng.integers(3, 9)))
         self.coarse = [smooth_noise(rng, side, int(rng.integers(4, 20))) for _ in range(3)]
         self.organ = rng.uniform(0.0, 1.4, 3)
@@ -44,6 +46,12 @@ class Decor:
         self.flow = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else 0.0
         self.rims = rng.uniform(0.0, 0.5, 2) * (rng.random(2) < 0.5) if rims else np.zeros(2)
         self.rim_px = rng.uniform(0.8, 1.6, 2) if rims else np.ones(2)
+        self.jets = (
+            rng.uniform(0.0, 1.0, (int(rng.integers(1, 5)), 5)) if fine else np.empty((0, 5))
+        )
+        if fine and rng.random() < 0.7:
+            self.jets = self.jets[:0]
+        self.septum_bare = fine and rng.random() < 0.5
 
     def paint(self, image: Float32, tissue: Label, contrast: Contrast) -> None:
         """Add the detail to one slice in place; ``tissue`` is that of its middle plane."""
@@ -63,9 +71,14 @@ class Decor:
         self._add_tubes(image, outside, contrast)
         blood = IS_BLOOD[tissue]
         image[blood] *= (1 + self.flow * self.coarse[1])[blood]
+        _darken_jets(image, blood, self.jets)
         muscle = np.zeros_like(image)
         for chamber, strands in self.strands.items():
-            strands.paint(muscle, tissue == chamber, self.fine, self.coarse[2])
+            cavity = tissue == chamber
+            # Most trabeculae of the right ventricle spring from its free wall.
+            bare = self.septum_bare and chamber == Tissue.RV_CAVITY
+            beside = cavity | (tissue == Tissue.LV_MYOCARDIUM) if bare else cavity
+            strands.paint(muscle, cavity, beside, self.fine, self.coarse[2])
         _paint_papillaries(muscle, tissue == Tissue.LV_CAVITY, self.papillaries)
         if muscle.any():
             muscle = cv2.GaussianBlur(muscle, (0, 0), self.edge_px)
@@ -109,12 +122,17 @@ class _Strands:
             depth_px = 2 * deepest_px
         return cls(depth_px, rng.uniform(-0.7, 1.2), rng.uniform(0.2, 1.0))
 
-    def paint(self, muscle: Float32, cavity: Mask, fine: Float32, coarse: Float32) -> None:
-        """Raise the share of muscle in place where strands stand in ``cavity``."""
+    def paint(
+        self, muscle: Float32, cavity: Mask, beside: Mask, fine: Float32, coarse: Float32
+    ) -> None:
+        """Raise the share of muscle in place where strands stand in ``cavity``.
+
+        They spring from the outline of ``beside``, which holds the cavity.
+        """
         if self.depth_px == 0 or not cavity.any():
             return
-        depth = cv2.distanceTransform(cavity.astype(np.uint8), cv2.DIST_L2, 3)
-        limit = min(self.depth_px, 0.6 * float(depth.max())) * (1 + 0.5 * coarse)
+        depth = cv2.distanceTransform(beside.astype(np.uint8), cv2.DIST_L2, 3)
+        limit = min(self.depth_px, 0.6 * float(depth[cavity].max())) * (1 + 0.5 * coarse)
         above = self.level + 0.5 * (depth / np.maximum(limit, 0.3) - 0.5)
         muscle[cavity & (depth < limit) & (fine > above)] = self.share
 
@@ -138,3 +156,21 @@ def _paint_papillaries(muscle: Float32, cavity: Mask, papillaries: Float) -> Non
         box = ((column, row), (2 * length * radius, 2 * width * radius), np.degrees(angle + turn))
         cv2.ellipse(oval, box, 1, cv2.FILLED)
         muscle[(oval > 0) & cavity] = 1.0
+
+
+def _darken_jets(image: Float32, blood: Mask, jets: Float) -> None:
+    """Darken ovals of blood that flows too fast for its signal, in place.
+
+    ``jets`` is ``(n, 5)``: which of the pixels of blood, length, width, darkness, turn; 0 to 1.
+    """
+    where = np.argwhere(blood) if len(jets) else jets
+    if not len(where):
+        return
+    dark = np.zeros_like(image)
+    for place, length, width, darkness, turn in jets:
+        row, column = where[int(place * (len(where) - 1))]
+        box = ((float(column), float(row)), (4 + 16 * length, 2 + 6 * width), 180 * turn)
+        oval = np.zeros(image.shape, np.uint8)
+        cv2.ellipse(oval, box, 1, cv2.FILLED)
+        dark[oval > 0] = 0.8 * darkness
+    image[blood] *= (1 - cv2.GaussianBlur(dark, (0, 0), 1.5))[blood]

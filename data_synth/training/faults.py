@@ -89,6 +89,20 @@ def _through_frequency_space(rng: np.random.Generator, image: Float32) -> Float3
     return np.abs(np.fft.ifft2(spectrum)).astype(np.float32)
 
 
+def windowed(rng: np.random.Generator, image: Float32) -> Float32:
+    """What is left of ``(3, row, column)`` images within a window of frequencies.
+
+    The sharper the window's edge, the more the image rings beside edges.
+    """
+    frequency = np.abs(np.fft.fftfreq(image.shape[-1])) * 2
+    soft = rng.uniform(0.02, 0.4)
+    rows, columns = (
+        np.clip((cut - frequency) / soft + 0.5, 0, 1) for cut in rng.uniform(0.55, 1.0, 2)
+    )
+    spectrum = np.fft.fft2(image) * rows[:, None] * columns
+    return np.abs(np.fft.ifft2(spectrum)).astype(np.float32)
+
+
 def _noisy(rng: np.random.Generator, image: Float32) -> Float32:
     """Magnitude of an image with complex Gaussian noise (Rice), fine or coarse in grain."""
     sigma = abs(rng.normal(0.0, 0.045))

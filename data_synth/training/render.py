@@ -6,7 +6,7 @@ network that is good on simulated cine has not merely learned its simulator.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,8 +20,9 @@ from data_synth.training.contrast import (
     Contrast,
     draw_contrast,
 )
+from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
-from data_synth.training.faults import smooth_noise, spoil, spoil_little
+from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
 
 Float = npt.NDArray[np.floating]
 Float32 = npt.NDArray[np.float32]
@@ -66,10 +67,23 @@ class Parts:
     """Hearts that lung and organs touch, without fat between: else a wall's outside could be
     guessed from how far off they are."""
 
+    fine: bool = True
+    """Walls that are thick in places, fat and pericardium in layers finer than a pixel, chambers
+    and aorta of any size each, jets of blood, septa without trabeculae, and a window of frequencies
+    that rings at edges."""
+
 
 ALL_PARTS = Parts()
 
 _WITHIN_MUSCLE = (Tissue.LV_CAVITY, Tissue.PAPILLARY_MUSCLE)
+
+_SIZES = {
+    Tissue.RV_CAVITY: 0.1,
+    Tissue.LEFT_ATRIUM: 0.15,
+    Tissue.RIGHT_ATRIUM: 0.15,
+    Tissue.AORTA: 0.22,
+}
+"""How widely the sizes of structures are drawn, apart from the left ventricle's cavity."""
 
 _COVERS = np.isin(list(Tissue), (Tissue.FAT, Tissue.PERICARDIUM))
 
@@ -97,14 +111,20 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     if parts.rims and rng.random() < 0.25:
         middle, end = _draw_grazing_plane(rng, block), 0
     planes = block[middle - REACH : middle + REACH + 1]
+    if parts.fine:
+        planes = whole_septum(planes)
     if parts.rims and rng.random() < 0.4:
         planes = thin_walled(planes, int(rng.integers(1, 4)))
+    if parts.fine and rng.random() < 0.45:
+        planes = thick_walled(rng, planes)
     bare = parts.bare and rng.random() < 0.55
     if bare:
-        planes = laid_bare(rng, planes)
+        planes = laid_bare(rng, planes, skin=not parts.fine)
     contrast = draw_contrast(rng) if parts.contrast else USUAL_CONTRAST
     slices = _thick_slices(rng, planes, contrast, parts, fat=not bare or rng.random() < 0.3)
     rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
+    if parts.fine and parts.shape:
+        rows, columns = _other_sizes(rng, planes[REACH], rows, columns)
     image = np.empty((3, CROP, CROP), np.float32)
     strays = parts.neighbours and rng.random() < 0.7
     strayed_px = rng.uniform(0.0, 2.2) if strays else 0.0
@@ -121,6 +141,8 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
         _drop_neighbours(rng, image, end)
     labels = LABEL_OF[planes[REACH - 1 : REACH + 2]]
     carried = [cv2.remap(one, columns, rows, cv2.INTER_NEAREST) for one in labels]
+    if parts.fine and parts.faults and rng.random() < 0.45:
+        image = windowed(rng, image)
     spoiled = spoil(rng, image) if parts.faults else spoil_little(rng, image)
     return Sample(spoiled, np.stack(carried))
 
@@ -189,18 +211,61 @@ def thin_walled(planes: Label, layers: int) -> Label:
     return thinner
 
 
-def laid_bare(rng: np.random.Generator, planes: Label) -> Label:
-    """The same heart with what lies around it reaching up to it in places.
+def whole_septum(planes: Label) -> Label:
+    """The same heart with no wall of the right ventricle between its cavity and the left's muscle.
 
-    Fat and pericardium near the heart become the nearest of lung, organs and diaphragm; in half of
-    all hearts one pixel of pericardium stays.
+    Blocks have stray pixels of it there, which thinner walls would draw out to fingers.
 
     Parameters
     ----------
     planes
         ``(plane, row, column)`` tissue.
     """
-    reach_px, skin_px = rng.uniform(3.0, 14.0), int(rng.integers(0, 2))
+    brush = np.ones((3, 3), np.uint8)
+    whole = planes.copy()
+    for plane in whole:
+        between = plane == Tissue.RV_WALL
+        for beside in ((Tissue.LV_MYOCARDIUM,), (Tissue.RV_CAVITY, Tissue.RV_TRABECULA)):
+            between &= cv2.dilate(np.isin(plane, beside).astype(np.uint8), brush) > 0
+        plane[between] = Tissue.LV_MYOCARDIUM
+    return whole
+
+
+def thick_walled(rng: np.random.Generator, planes: Label) -> Label:
+    """The same heart with its left ventricle's muscle grown outwards, here more and there less.
+
+    How thick a wall is then tells nothing of where it ends: the edge in the image has to. Muscle
+    takes the place of what lies outside the heart alone.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue.
+    """
+    uneven = smooth_noise(rng, planes.shape[-1], int(rng.integers(4, 9)))
+    grown_px = rng.uniform(-1.0, 4.0) + rng.uniform(0.0, 2.5) * uneven
+    thicker = planes.copy()
+    for plane in thicker:
+        muscle = np.isin(plane, (Tissue.LV_MYOCARDIUM, Tissue.SCAR))
+        if muscle.any():
+            away_px = cv2.distanceTransform((~muscle).astype(np.uint8), cv2.DIST_L2, 3)
+            free = ~IN_HEART[plane] | (plane == Tissue.PERICARDIUM)
+            plane[free & (away_px < np.clip(grown_px, 0, 6) + 0.5)] = Tissue.LV_MYOCARDIUM
+    return thicker
+
+
+def laid_bare(rng: np.random.Generator, planes: Label, skin: bool = True) -> Label:
+    """The same heart with what lies around it reaching up to it in places.
+
+    Fat and pericardium near the heart become the nearest of lung, organs and diaphragm; with
+    ``skin``, one pixel of pericardium stays in half of all hearts.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue.
+    """
+    reach_px, skin_px = rng.uniform(3.0, 14.0), int(rng.integers(0, 2)) * skin
     chosen = smooth_noise(rng, planes.shape[-1], int(rng.integers(2, 6))) > rng.uniform(-2.5, 0.3)
     bare = planes.copy()
     for plane in bare:
@@ -248,13 +313,28 @@ def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Plac
     return rows.astype(np.float32), columns.astype(np.float32)
 
 
-def _swollen(rng: np.random.Generator, plane: Label, rows: Float, columns: Float) -> Places:
-    """Positions that make the left ventricle's cavity wider or narrower than its wall's outside.
+def _other_sizes(rng: np.random.Generator, plane: Label, rows: Float, columns: Float) -> Places:
+    """Positions that make each other chamber and the aorta wider or narrower, some of the time."""
+    for tissue, sd in _SIZES.items():
+        if rng.random() < 0.35:
+            rows, columns = _swollen(rng, plane, rows, columns, tissue, sd)
+    return rows.astype(np.float32), columns.astype(np.float32)
+
+
+def _swollen(
+    rng: np.random.Generator,
+    plane: Label,
+    rows: Float,
+    columns: Float,
+    tissue: Tissue = Tissue.LV_CAVITY,
+    sd: float = 0.18,
+) -> Places:
+    """Positions that make a cavity wider or narrower than what surrounds it.
 
     A radial scaling that fades out: r (1 + a exp(-(r / reach)^2)) rises everywhere while
-    -1 < a < 2.2, so nothing folds.
+    -1 < a < 2.2, so nothing folds; ``sd`` is the deviation of a.
     """
-    cavity = np.argwhere(plane[::2, ::2] == Tissue.LV_CAVITY) * 2.0
+    cavity = np.argwhere(plane[::2, ::2] == tissue) * 2.0
     if not len(cavity):
         return rows, columns
     radius = np.sqrt(4 * len(cavity) / np.pi)
@@ -262,7 +342,7 @@ def _swollen(rng: np.random.Generator, plane: Label, rows: Float, columns: Float
     away_rows, away_columns = rows - middle[0], columns - middle[1]
     reach = max(radius, 4.0) * rng.uniform(0.7, 2.0)
     square = (away_rows**2 + away_columns**2) / reach**2
-    factor = np.clip(rng.normal(0.0, 0.18), -0.35, 0.5) * np.exp(-square)
+    factor = np.clip(rng.normal(0.0, sd), -0.35, 0.5) * np.exp(-square)
     return rows + factor * away_rows, columns + factor * away_columns
 
 
@@ -278,17 +358,27 @@ def _thick_slices(
     weights = (weights / weights.sum()).astype(np.float32)
     grain = 0.7 * smooth_noise(rng, side, side // int(rng.integers(3, 8)))
     grain += 0.7 * smooth_noise(rng, side, int(rng.integers(4, 24)))
-    decor = Decor(rng, side, parts.rims, fat) if parts.detail else None
+    decor = None
+    if parts.detail:
+        own = parts.rims and not parts.fine, fat and not parts.fine
+        decor = Decor(rng, side, *own, fine=parts.fine)
     mean = contrast.mean.copy()
-    if rng.random() < 0.5:
+    if rng.random() < (0.65 if parts.fine else 0.5):
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
         mean[Tissue.FAT] *= -1
     border_px = rng.uniform(0.35, 0.7)
+    covers = Coverings(rng, side, replace(contrast, mean=mean)) if parts.fine else None
+    if covers is not None:
+        mean[Tissue.PERICARDIUM] = covers.sac
     images = np.empty((3, side, side), np.float32)
     for channel in range(3):
         middle = REACH + NEIGHBOUR * (channel - 1)
         near = planes[middle - 2 : middle + 3]
-        signed = np.tensordot(weights, mean[near], 1)
+        grey = mean[near]
+        if covers is not None:
+            for number in np.flatnonzero(weights):
+                covers.paint(grey[number], near[number])
+        signed = np.tensordot(weights, grey, 1)
         images[channel] = np.abs(cv2.GaussianBlur(signed, (0, 0), border_px))
         images[channel] += contrast.texture[near[2]] * grain
         if decor is not None:

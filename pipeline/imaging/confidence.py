@@ -19,8 +19,9 @@ from pipeline.imaging.network import neighbour_steps
 from pipeline.imaging.view import View
 
 LEAST_CUT = 0.25
-"""A slice with less than this share of the largest cut through the heart is judged by the heart's
-outline over all slices: where a slice grazes the tip, its few pixels are doubtful by nature."""
+"""Certainty is that of a cut larger by this share of the largest one, the part added as certain as
+the heart's outline over all slices: where a slice grazes the tip, its few pixels are doubtful by
+nature, and none would be left where it shows no heart."""
 
 COMPARED_CUT = 0.35
 """The heart on a slice is compared with that on its neighbours where either shows this share of the
@@ -59,7 +60,7 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     heart = np.stack([_without_strays(labels > 0) for labels in drawn])
     area = heart.sum(axis=(2, 3))
     largest = np.maximum(area.max(axis=1, keepdims=True), 1)
-    confidence = _certainty(found, heart, area >= LEAST_CUT * largest)
+    confidence = _certainty(found, heart)
     large = area >= COMPARED_CUT * largest
     images = _images(cine, found.view)
     before, after = np.roll(heart, 1, axis=0), np.roll(heart, -1, axis=0)
@@ -100,15 +101,24 @@ def _last_reached(heart: Mask, start: int, step: int) -> int:
     return last
 
 
-def _certainty(found: PlaneProbability, heart: Mask, large: Mask) -> Float:
-    """Mean probability of the labels chosen, over the heart or, beside it, over its outline."""
+def _certainty(found: PlaneProbability, heart: Mask) -> Float:
+    """Dice that the network itself expects of its labels, ``(phase, slice)``.
+
+    Twice the probability of the labels chosen, summed over the heart, over its pixels and the
+    probability of any structure within its outline: what was taken for heart in vain and what was
+    missed count alike.
+    """
     certainty = np.empty(heart.shape[:2])
     for phase, slices in enumerate(heart):
-        likely = found.at_slices(phase).max(axis=1)
+        probability = found.at_slices(phase)
         outline = slices.any(axis=0)
+        added = LEAST_CUT * slices.sum(axis=(1, 2)).max()
         for number, own in enumerate(slices):
-            region = own if large[phase, number] else outline
-            certainty[phase, number] = likely[number][region].mean() if region.any() else 0.0
+            likely = probability[number].max(axis=0)
+            sure = likely[outline].mean() if outline.any() else 0.0
+            either = own.sum() + (1 - probability[number, 0][outline]).sum()
+            agreed = 2 * likely[own].sum() + added * sure
+            certainty[phase, number] = agreed / max(either + added, 1e-9)
     return certainty
 
 

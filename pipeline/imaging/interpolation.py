@@ -30,6 +30,15 @@ CAP_STEP_MM = 1.5
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
+DECIDED = 0.5
+"""By this much a class is more probable than every other where it is taken for certain. The network
+doubts a wall up to its outer edge, and beyond it no more: with the probability itself, the line
+from 0.6 just inside to 0.05 just outside would cross 0.5 next to the inner pixel, and all that
+lies against the background come out too small."""
+
+EDGE_PX = 0.8
+"""Standard deviation, pixels, by which class margins are smoothed: what they decide has stairs."""
+
 REFINE = 2
 """In-plane refinement of the outlines: distances are exact to a quarter of a pixel."""
 
@@ -126,16 +135,32 @@ def plane_depth_mm(
     (class, row, column) array
         Minus infinity for a class that the plane does not have.
     """
-    best_two = np.partition(probability, -2, axis=0)[-2:]
     size = [int((side - 1) * pixel_mm / grid_mm) + 1 for side in probability.shape[1:]]
     depth = np.full((len(probability), *size), -np.inf, np.float32)
-    for value, chance in enumerate(probability):
-        rival = np.where(chance >= best_two[1], best_two[0], best_two[1])
-        margin = chance - rival
+    for value, margin in enumerate(class_margins(probability)):
         if (margin > 0).any():
             fine = _magnified(margin, pixel_mm, shift_mm, grid_mm, size)
             depth[value] = _signed_depth_mm(fine, grid_mm)
     return depth
+
+
+def class_margins(probability: Float32) -> Float32:
+    """How clearly each class is the most probable one: from -1, it is not, to 1; 0 at its border.
+
+    Parameters
+    ----------
+    probability
+        ``(class, row, column)`` on one plane.
+
+    Returns
+    -------
+    (class, row, column) array
+        What can be resampled, where the probability itself would move borders (`DECIDED`).
+    """
+    second, first = np.partition(probability, -2, axis=0)[-2:]
+    rival = np.where(probability >= first, second, first)
+    decided = np.clip((probability - rival) / np.float32(DECIDED), -1, 1)
+    return np.stack([cv2.GaussianBlur(one, (0, 0), EDGE_PX) for one in decided])
 
 
 def _magnified(

@@ -19,7 +19,7 @@ from pipeline.imaging.inference import (
     blend_phases,
     label_probability,
 )
-from pipeline.imaging.interpolation import isotropic_labels
+from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
@@ -236,10 +236,11 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
     for phase in range(len(labels)):
         probability = found.at_slices(phase)
         for number, z in enumerate(found.view.order):
-            structures = [
-                found.view.restore(p, number, (rows, columns)) for p in probability[number, 1:]
-            ]
-            # Outside the view nothing is probable: there background is what remains of 1.
-            chance: Float32 = np.stack([1 - np.sum(structures, axis=0), *structures])
+            margins = class_margins(probability[number])
+            # Outside the view, where restored values are 0, lies background.
+            margins[0] -= 1
+            margins[1:] += 1
+            carried = [found.view.restore(one, number, (rows, columns)) for one in margins]
+            chance: Float32 = np.stack([carried[0] + 2, *carried[1:]])
             labels[phase, z] = chance.argmax(axis=0)
     return labels

@@ -1,0 +1,62 @@
+"""What covers a heart: layers of fat and pericardium, mostly thinner than a pixel.
+
+A block's pixels are too coarse for them, yet they decide where a wall seems to end: fat whose
+signal is opposed cancels the muscle's in a pixel that both share, and the dark line stands inside
+the wall or outside it, as thick as the two happen to be.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from data_synth.tissue import Tissue
+from data_synth.training.contrast import IN_HEART, Contrast
+from data_synth.training.faults import smooth_noise
+
+Float32 = npt.NDArray[np.float32]
+Label = npt.NDArray[np.uint8]
+
+
+class Coverings:
+    """Layers on the outside of one heart, the same in all slices of an image."""
+
+    def __init__(self, rng: np.random.Generator, side: int, contrast: Contrast) -> None:
+        thick_px, chance = rng.uniform(0.0, 1.0), rng.random()
+        if chance < 0.35:
+            thick_px = 0.0
+        elif chance < 0.75:
+            thick_px *= 1.6
+        else:
+            thick_px = 1.6 + 6.0 * thick_px
+        uneven = rng.uniform(0.0, 1.2) * smooth_noise(rng, side, int(rng.integers(3, 10)))
+        self.fat_px = np.maximum(thick_px * (1 + uneven), 0)
+        self.sac_px = rng.uniform(0.2, 1.3) if rng.random() < 0.6 else 0.0
+        # Mostly fat; an effusion or an organ may lie against the heart as well.
+        beside = rng.uniform(0.0, 1.2)
+        self.fat = contrast.mean[Tissue.FAT] if rng.random() < 0.85 else beside
+        # Fibrous and dark; as grey as muscle in a few, which no edge then tells apart.
+        self.sac = contrast.muscle * (rng.uniform(0.0, 0.7) if rng.random() < 0.9 else 1.0)
+
+    def paint(self, signed: Float32, tissue: Label) -> None:
+        """Cover the heart in one plane, in place.
+
+        Parameters
+        ----------
+        signed
+            ``(row, column)`` brightness, negative where the signal is opposed.
+        tissue
+            Of the same plane.
+        """
+        inside = IN_HEART[tissue]
+        if not inside.any():
+            return
+        away_px = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
+        # A pixel at distance d reaches from d - 1 to d beyond the outline between pixels.
+        near = (away_px > 0) & (away_px < self.fat_px.max() + self.sac_px + 1)
+        within, fat = away_px[near] - 1, self.fat_px[near]
+        of_fat = np.clip(fat - within, 0, 1)
+        of_both = np.clip(fat + self.sac_px - within, 0, 1)
+        beyond = (1 - of_both) * signed[near]
+        signed[near] = of_fat * self.fat + (of_both - of_fat) * self.sac + beyond

@@ -1,0 +1,167 @@
+"""What training images show more finely than tissue blocks do, and what is made to vary."""
+
+import numpy as np
+import pytest
+
+from data_synth.tissue import Tissue
+from data_synth.training.contrast import IS_BLOOD, USUAL_CONTRAST
+from data_synth.training.coverings import Coverings
+from data_synth.training.decor import Decor
+from data_synth.training.faults import windowed
+from data_synth.training.render import _other_sizes, thick_walled, whole_septum
+
+SIDE = 64
+ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE]
+AWAY = np.hypot(ROWS - 32, COLUMNS - 32)
+
+
+def short_axis(outside=Tissue.LUNG):
+    """A left ventricle of 12 to 18 pixels' radius, the right one to the left of it."""
+    plane = np.full((SIDE, SIDE), outside)
+    plane[(np.hypot(ROWS - 32, COLUMNS - 20) < 18)] = Tissue.RV_WALL
+    plane[(np.hypot(ROWS - 32, COLUMNS - 20) < 16)] = Tissue.RV_CAVITY
+    plane[AWAY < 18] = Tissue.LV_MYOCARDIUM
+    plane[AWAY < 12] = Tissue.LV_CAVITY
+    return plane.astype(np.uint8)
+
+
+def layers(seed, fat_px, sac_px):
+    """Coverings of a set, even thickness, in the usual contrast."""
+    found = Coverings(np.random.default_rng(seed), SIDE, USUAL_CONTRAST)
+    found.fat_px = np.full((SIDE, SIDE), fat_px)
+    found.sac_px = sac_px
+    return found
+
+
+@pytest.mark.parametrize(("fat_px", "sac_px"), [(0.0, 0.4), (0.3, 0.0), (0.7, 0.9), (3.5, 1.2)])
+def test_layers_take_their_thickness_of_the_signal_and_leave_the_heart_alone(fat_px, sac_px):
+    """Beside a straight wall pixels end at whole distances: what they hold is plain arithmetic."""
+    plane = np.where(COLUMNS < 32, Tissue.LV_MYOCARDIUM, Tissue.LUNG).astype(np.uint8)
+    covers = layers(1, fat_px, sac_px)
+    signed = np.where(COLUMNS < 32, 0.3, 0.1).astype(np.float32)
+
+    covers.paint(signed, plane)
+
+    np.testing.assert_array_equal(signed[:, :32], np.float32(0.3))
+    added = (signed[:, 32:].astype(float) - 0.1).sum(axis=1)
+    expected = fat_px * (covers.fat - 0.1) + sac_px * (covers.sac - 0.1)
+    # A chamfer distance counts 0.955 for a step along rows: each layer's two ends may lie 4.5 % of
+    # their way, and of a pixel, farther out.
+    farther_px = 0.045 * (fat_px + sac_px + 1)
+    allowed = farther_px * (abs(covers.fat - 0.1) + 2 * abs(covers.sac - 0.1))
+    np.testing.assert_allclose(added, expected, atol=allowed)
+
+
+def test_opposed_fat_thinner_than_a_pixel_darkens_it_below_both_neighbours():
+    plane = np.where(COLUMNS < 32, Tissue.LV_MYOCARDIUM, Tissue.LUNG).astype(np.uint8)
+    covers = layers(2, 0.5, 0.0)
+    covers.fat = -0.3
+    signed = np.where(COLUMNS < 32, 0.35, 0.2).astype(np.float32)
+    covers.paint(signed, plane)
+    assert (np.abs(signed[:, 32]) < 0.1).all()
+
+
+def test_coverings_are_drawn_absent_thin_and_thick():
+    drawn = [
+        Coverings(np.random.default_rng(k), SIDE, USUAL_CONTRAST).fat_px.mean() for k in range(300)
+    ]
+    assert 0.25 < np.mean(np.equal(drawn, 0)) < 0.45
+    assert np.mean(np.greater(drawn, 2)) > 0.15
+    thin = [one for one in drawn if 0 < one < 1]
+    assert len(thin) > 50
+
+
+def test_thick_walls_grow_outwards_alone_and_unevenly():
+    plane = short_axis()
+    rng = np.random.default_rng(3)
+    found = np.stack([thick_walled(rng, plane[None])[0] for _ in range(40)])
+    changed = found != plane
+    assert (found[changed] == Tissue.LV_MYOCARDIUM).all()
+    assert set(np.unique(plane[changed.any(axis=0)])) == {Tissue.LUNG}
+    # Six pixels at most, counted from the muscle's last one.
+    assert AWAY[changed.any(axis=0)].max() < 18 + 6 + 1
+    grown = [one[32, 50:].sum() for one in changed]
+    assert min(grown) == 0
+    assert max(grown) >= 4
+    above, below = changed[:, :32, 32].sum(axis=1), changed[:, 33:, 32].sum(axis=1)
+    assert (above != below).mean() > 0.3
+
+
+def test_septum_has_no_wall_of_the_right_ventricle():
+    plane = short_axis()
+    stray = (AWAY >= 17.2) & (AWAY < 18) & (COLUMNS < 20) & (np.abs(ROWS - 32) < 8)
+    assert stray.any()
+    mixed = np.where(stray, Tissue.RV_WALL, plane).astype(np.uint8)
+    found = whole_septum(mixed[None])[0]
+    assert (found[stray] == Tissue.LV_MYOCARDIUM).all()
+    # The free wall stays, but where it meets the septum.
+    free = (plane == Tissue.RV_WALL) & (COLUMNS < 12)
+    assert (found[free] == Tissue.RV_WALL).all()
+    assert (found[plane != Tissue.RV_WALL] == plane[plane != Tissue.RV_WALL]).all()
+
+
+def test_other_structures_change_size_and_nothing_folds():
+    plane = short_axis(Tissue.FAT)
+    plane[np.hypot(ROWS - 10, COLUMNS - 50) < 6] = Tissue.AORTA
+    rows, columns = ROWS.astype(np.float32), COLUMNS.astype(np.float32)
+    sizes = []
+    for seed in range(80):
+        down, across = _other_sizes(np.random.default_rng(seed), plane, rows, columns)
+        area = np.diff(down, axis=0)[:, :-1] * np.diff(across, axis=1)[:-1]
+        area -= np.diff(down, axis=1)[:-1] * np.diff(across, axis=0)[:, :-1]
+        assert area.min() > 0
+        near = np.rint([down, across]).astype(int).clip(0, SIDE - 1)
+        sizes.append((plane[tuple(near)] == Tissue.AORTA).sum())
+    assert np.std(sizes) > 0.1 * np.mean(sizes)
+
+
+def test_jets_darken_blood_alone():
+    plane = short_axis(Tissue.AIR)
+    shown = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        decor = Decor(rng, SIDE, rims=False, fat=False)
+        decor.flow, decor.papillaries = 0.0, np.empty((0, 5))
+        for strands in decor.strands:
+            decor.strands[strands] = type(decor.strands[strands])(0.0, 0.0, 0.0)
+        image = np.ones((SIDE, SIDE), np.float32)
+        decor.paint(image, plane, USUAL_CONTRAST)
+        blood = IS_BLOOD[plane]
+        np.testing.assert_array_equal(image[~blood], 1)
+        assert image.max() <= 1
+        assert image.min() > 0.15
+        shown += image[blood].min() < 0.9
+    assert 3 <= shown <= 20
+
+
+def test_septum_without_trabeculae_still_has_them_on_the_free_wall():
+    plane = short_axis(Tissue.FAT)
+    cavity = plane == Tissue.RV_CAVITY
+    septum = cavity & (AWAY < 21)
+    found = {True: [], False: []}
+    for seed in range(60):
+        decor = Decor(np.random.default_rng(seed), SIDE, rims=False, fat=False)
+        decor.flow, decor.jets = 0.0, decor.jets[:0]
+        image = np.ones((SIDE, SIDE), np.float32)
+        decor.paint(image, plane, USUAL_CONTRAST)
+        # Away from the ends of the septum, where it meets the free wall.
+        middle = np.abs(ROWS - 32) < 8
+        dark = image < 0.9
+        found[decor.septum_bare].append((dark[septum & middle].any(), dark[cavity].any()))
+    bare, usual = np.mean(found[True], axis=0), np.mean(found[False], axis=0)
+    assert bare[1] > 0.4
+    assert bare[0] < 0.5 * usual[0]
+
+
+def test_window_of_frequencies_keeps_the_mean_and_rings_at_edges():
+    disc = np.where(AWAY < 14, 1.0, 0.2).astype(np.float32)
+    image = np.broadcast_to(disc, (3, SIDE, SIDE))
+    over = []
+    for seed in range(20):
+        found = windowed(np.random.default_rng(seed), image)
+        # The middle of k-space is the sum; magnitude can only add where the ringing is negative.
+        assert found.mean() == pytest.approx(image.mean(), rel=0.02)
+        over.append(found.max())
+    # Gibbs: a sharply cut edge overshoots by 9 % of its height, here 0.8, a soft one by less.
+    assert max(over) > 1.04
+    assert max(over) < 1.3
