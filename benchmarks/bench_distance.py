@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import nnls
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -204,7 +205,7 @@ def curve(rounds: int) -> None:
             f"| {least / nodes**3 * 1e9:.0f} |",
             flush=True,
         )
-    share, *_ = np.linalg.lstsq(np.array(terms) / np.array(seconds)[:, None], np.ones(len(cases)))
+    share, _ = nnls(np.array(terms) / np.array(seconds)[:, None], np.ones(len(cases)))
     off = np.array(terms) @ share / seconds - 1
     print(
         f"core-s = {share[0] * 1e9:.0f}e-9 nodes + {share[1] * 1e6:.2f}e-6 triangles "

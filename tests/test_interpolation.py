@@ -65,6 +65,23 @@ def test_depth_of_a_disc_is_its_radius_less_the_distance_from_its_centre():
     np.testing.assert_allclose(depth_mm[0][near], -truth_mm[near], rtol=0, atol=allowed_mm)
 
 
+@pytest.mark.parametrize("radius_px", [18.0, 20.3, 22.7])
+def test_doubt_on_one_side_of_a_border_does_not_move_it(radius_px):
+    """Probability that falls towards the edge from inside, and is nil at once beyond it."""
+    x, y = in_plane_mm()
+    within_px = radius_px - np.hypot(x, y) / PIXEL_MM
+    chance = np.where(within_px > 0, np.minimum(0.7 + 0.05 * within_px, 1.0), 0.02)
+    grid_mm = 0.5
+    depth_mm = plane_depth_mm(
+        np.stack([1 - chance, chance]).astype(np.float32), PIXEL_MM, np.zeros(2), grid_mm
+    )
+    found_px = np.sqrt((depth_mm[1] > 0).sum() * grid_mm**2 / np.pi) / PIXEL_MM
+    # Beside the edge margins of 0.8 and -1 meet: the line between them crosses zero 0.06 pixels
+    # short of half-way, and smoothing moves an arc inwards by EDGE_PX**2 / 2 r, 0.02. Between
+    # margins that are not cut off, 0.4 and -0.96, it would be 0.2 and more.
+    assert found_px == pytest.approx(radius_px, abs=0.12)
+
+
 def test_a_class_that_a_plane_lacks_is_infinitely_far():
     depth_mm = plane_depth_mm(
         np.stack([np.ones((8, 8)), np.zeros((8, 8))]).astype(np.float32), 1.5, np.zeros(2), 1.5
