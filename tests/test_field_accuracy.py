@@ -103,10 +103,12 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(
     each = [heart.surfaces(float(phase))[structure] for phase in phases]
     moving = MovingSurface(np.stack([one[0] for one in each]), each[0][1], phases)
     fixture = Fixture(structure=structure, kind="guidance", delta_mm=8.0, f_max_n=1.0)
-    said = bake_field(
-        tmp_path / "f.zarr", {structure: moving}, {"g": fixture}, BakeSettings(samples=100)
-    )
+    settings = BakeSettings(samples=100)
+    said = bake_field(tmp_path / "f.zarr", {structure: moving}, {"g": fixture}, settings)
     field = ForceField.open(tmp_path / "f.zarr")
+    stated = json.loads((tmp_path / "f.zarr" / "zarr.json").read_text())
+    stated_mm = stated["attributes"]["beatfield"]["structures"][structure]["correction_mm"]
+    assert 0 < stated_mm <= settings.spacing_mm
     off = []
     for moment in np.concatenate([(phases + 0.02)[::5], (phases + 0.011)[2::5]]):
         vertices_mm, triangles = heart.surfaces(float(moment))[structure]

@@ -32,6 +32,9 @@ NEAR_ENOUGH = 0.035
 """A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
 weight: to bring it nearer still would cost the gradient about it more than it is worth."""
 MOST_WEIGHT = 500.0
+MOST_CHANGE = 1.0
+"""No coefficient moves by more than so many spacings: where two rims share their nodes, no change
+suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
 # Minima and maxima aside, only the order of sums may change.
 FAST = {"contract", "nnan", "nsz"}
@@ -169,9 +172,11 @@ class _Fit:
     ) -> None:
         self._moments = moments
         self._near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
+        self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
         self._layer = np.empty_like(coefficients[0])
         self._change = np.zeros_like(coefficients)
-        self._off = [-one for one in self._values(coefficients)]
+        self._before = [-one for one in self._values(coefficients)]
+        self._off = [one.copy() for one in self._before]
         self._weights = [np.ones_like(one) for one in self._off]
 
     def after(self, rounds: int) -> Float32:
@@ -180,7 +185,16 @@ class _Fit:
             if number:
                 self._weigh()
             self._least_squares()
+            self._bound()
         return self._change
+
+    def _bound(self) -> None:
+        """Take back what moves a coefficient too far."""
+        most_mm = self._most_mm
+        if np.abs(self._change).max() > most_mm:
+            np.clip(self._change, -most_mm, most_mm, out=self._change)
+            moved = self._values(self._change)
+            self._off = [one - other for one, other in zip(self._before, moved, strict=True)]
 
     def _weigh(self) -> None:
         """More weight to points that are too far off."""
