@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.imaging.alignment import slice_shifts_mm
@@ -129,9 +129,14 @@ def test_sphere_ends_within_half_a_plane_step_of_its_poles():
 
 
 @given(lean=st.floats(-1.0, 1.0), offset_mm=st.floats(-5, 5))
+@example(lean=1.0, offset_mm=0.75)
 @settings(max_examples=15, deadline=None)
 def test_slanting_wall_between_two_structures_stays_flat(lean, offset_mm):
-    """Depths of half-spaces are linear in height, so interpolation is exact."""
+    """Depths of half-spaces are linear in height, so interpolation is exact.
+
+    A wall in its plane is not: margins of 1 at most, tanh(2 u) / 0.5 at u pixels from the wall of
+    `soft`, are drawn as a line between two pixels, whose zero is up to 0.235 pixels off (u = 0.22).
+    """
     plane_mm = np.arange(0, 30.1, STEP_MM)
     x, _ = in_plane_mm()
     depth_mm = x[None] - offset_mm - lean * (plane_mm - 15)[:, None, None]
@@ -145,7 +150,7 @@ def test_slanting_wall_between_two_structures_stays_flat(lean, offset_mm):
     across_mm = first_mm[0] + PIXEL_MM * np.arange(volume.shape[2]) - CENTRE_MM
     for height, plane in zip(height_mm[inner], volume[inner], strict=True):
         wall_mm = offset_mm + lean * (height - 15)
-        clear = np.abs(across_mm - wall_mm) > OUTLINE_MM + 0.05
+        clear = np.abs(across_mm - wall_mm) > OUTLINE_MM + 0.235 * PIXEL_MM
         expected = np.where(across_mm > wall_mm, 1, 2)[clear]
         np.testing.assert_array_equal(
             plane[:, clear], np.broadcast_to(expected, plane[:, clear].shape)
