@@ -106,11 +106,10 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
         walk[2] = _piece_length(line_mm, 0)
     longest = 2.0 * min(grid[3], grid[4], grid[5])
     count = max(math.ceil(total / (4.0 * longest)), 1)
-    asked = 0
+    asked = count
     for number in range(count):
         middle = (number + 0.5) * total / count
         _feel(law, line_mm, pose, phase, middle, walk, stack[0])
-        asked += 1
         if total == 0.0:
             _add(found, stack[0], 1.0, pose, handle_mm)
             continue
