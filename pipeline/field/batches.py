@@ -13,9 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
 from pipeline.field import kernels
 from pipeline.geometry import Float
@@ -31,6 +29,7 @@ _LINE = 64
 _MANY_LINES = 16
 
 _spline_at, _felt_at, _moment_of = kernels.spline_at, kernels.felt_at, kernels.moment_of
+_fetch = kernels.fetch
 _ASKED, _INNER = kernels.ASKED, kernels.INNER
 
 
@@ -50,22 +49,6 @@ def follow(points_mm: Float, phases: Float, grid: Float, phase_count: int) -> bo
         beats = phases[first + 1] - phases[first]
         far |= np.abs(beats - np.floor(beats + 0.5)) * phase_count > 2
     return bool(far.sum() < _PAIRS // 4)
-
-
-@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
-def _fetch(typing_context: Any, address: Any) -> Any:
-    """Bring the line at an address into the outer cache, without waiting for it."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, whole, whole, whole])
-        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        # To be read; not into the innermost cache, which is too small for it; as data.
-        hints = [ir.Constant(whole, n) for n in (0, 2, 1)]
-        builder.call(prefetch, [builder.inttoptr(arguments[0], pointer), *hints])
-        return context.get_dummy_value()
-
-    return types.void(types.uintp), generate
 
 
 @njit(**_ASKED)

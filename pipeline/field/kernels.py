@@ -10,6 +10,7 @@ import functools
 import math
 from typing import Any
 
+import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.core import cgutils
@@ -23,6 +24,9 @@ for _formula in (formulas.offence, formulas.potential, formulas.pull, formulas.d
 _pull = formulas.pull
 _direction_scale = formulas.direction_scale
 
+
+AHEAD = 16
+"""How many questions ahead of its answer what one asks for is brought into the cache."""
 
 CONTRACT = {"contract"}
 """A product and a sum may be rounded once instead of twice; nothing else is relaxed."""
@@ -184,6 +188,42 @@ def spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[n
     return value, gx * grid[9], gy * grid[10], gz * grid[11]
 
 
+@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
+def fetch(typing_context: Any, address: Any) -> Any:
+    """Bring the line at an address into the outer cache, without waiting for it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, whole, whole, whole])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+        # To be read; not into the innermost cache, which is too small for it; as data.
+        hints = [ir.Constant(whole, n) for n in (0, 2, 1)]
+        builder.call(prefetch, [builder.inttoptr(arguments[0], pointer), *hints])
+        return context.get_dummy_value()
+
+    return types.void(types.uintp), generate
+
+
+@njit(**INNER)
+def _expect(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
+    """Bring what a question will ask for into the cache.
+
+    Returns the middle of the cell where all questions ask for the same, and its interval.
+    """
+    width, layer, last = int(grid[6]), int(grid[6] * grid[7]), len(addresses) - 1
+    k, _ = moment_of(line, phase)
+    i = int(min(max((x_mm - grid[0]) * grid[9] - 0.5, 0.0), grid[6] - 3.0))
+    j = int(min(max((y_mm - grid[1]) * grid[10] - 0.5, 0.0), grid[7] - 3.0))
+    n = int(min(max((z_mm - grid[2]) * grid[11] - 0.5, 0.0), grid[8] - 3.0))
+    first = layer * n + width * j + i
+    for moment in (k - 1 if k > 0 else last, k, k + 1 if k < last else 0):
+        for c in range(3):
+            for b in range(3):
+                fetch(addresses[moment] + np.uintp(4 * (first + layer * c + width * b)))
+    x_mm, y_mm = grid[0] + (i + 1) * grid[3], grid[1] + (j + 1) * grid[4]
+    return x_mm, y_mm, grid[2] + (n + 1) * grid[5], line[k, 0], line[k, 1]
+
+
 @njit(**ASKED)
 def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Distance and gradient at one point: four numbers, none where the question has none.
@@ -238,7 +278,16 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
     distance_mm, gradient
         Where the ``(n,)`` distances and ``(n, 3)`` gradients go.
     """
+    # The cell that was fetched last, and its interval of phases; none yet.
+    cx, cy, cz, since, until = math.inf, 0.0, 0.0, 0.0, 0.0
+    hx, hy, hz = 0.5 * grid[3], 0.5 * grid[4], 0.5 * grid[5]
     for n in range(len(points_mm)):
+        if n + AHEAD < len(points_mm):
+            x, y, z = points_mm[n + AHEAD, 0], points_mm[n + AHEAD, 1], points_mm[n + AHEAD, 2]
+            then = phases[n + AHEAD if len(phases) > 1 else 0]
+            inside = abs(x - cx) < hx and abs(y - cy) < hy and abs(z - cz) < hz
+            if not (inside and since <= then < until):
+                cx, cy, cz, since, until = _expect(addresses, line, grid, x, y, z, then)
         phase = phases[n if len(phases) > 1 else 0]
         value, gx, gy, gz = spline_at(
             addresses, line, grid, points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase
@@ -250,7 +299,17 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
 @njit(**ASKED)
 def sample_force(law, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
     """Force at points into ``(n, 3)``; ``law`` is the first seven arguments of ``force_at``."""
+    addresses, line, grid = law[:3]
+    # The cell that was fetched last, and its interval of phases; none yet.
+    cx, cy, cz, since, until = math.inf, 0.0, 0.0, 0.0, 0.0
+    hx, hy, hz = 0.5 * grid[3], 0.5 * grid[4], 0.5 * grid[5]
     for n in range(len(points_mm)):
+        if n + AHEAD < len(points_mm):
+            x, y, z = points_mm[n + AHEAD, 0], points_mm[n + AHEAD, 1], points_mm[n + AHEAD, 2]
+            then = phases[n + AHEAD if len(phases) > 1 else 0]
+            inside = abs(x - cx) < hx and abs(y - cy) < hy and abs(z - cz) < hz
+            if not (inside and since <= then < until):
+                cx, cy, cz, since, until = _expect(addresses, line, grid, x, y, z, then)
         phase = phases[n if len(phases) > 1 else 0]
         fx, fy, fz, _ = felt_at(law, points_mm[n, 0], points_mm[n, 1], points_mm[n, 2], phase)
         force_n[n, 0], force_n[n, 1], force_n[n, 2] = fx, fy, fz

@@ -1119,30 +1119,27 @@ BF__WIDE BF__INLINE void bf__wide_plane(const bf__place *at, const __m256d time[
     sums->along_z = _mm256_fmadd_pd(_mm256_set1_pd(at->sz[c]), plane.value, sums->along_z);
 }
 
-/* bf__at by rows of four nodes, summed along x last. */
-BF__WIDE static double bf__wide_at(const bf_field *field, int structure, const double point_mm[3],
-                                   double phase, double gradient[3])
+/* bf__sum by rows of four nodes, summed along x last. */
+BF__WIDE static double bf__wide_sum(const bf_field *field, const bf__place *at, double gradient[3])
 {
     ptrdiff_t width = field->shape[0], layer = width * field->shape[1], base, left, row[3];
-    bf__place at;
     bf__rows sums;
     __m256d time[3], wx, sx, low, high;
     double found[4];
-    bf__locate(field, structure, point_mm, phase, &at);
-    base = at.ix[1] - 1 < 0 ? 0 : at.ix[1] - 1 > width - 4 ? width - 4 : at.ix[1] - 1;
-    left = at.ix[1] - 1 - base;
-    row[0] = at.iy[0] * width + base;
-    row[1] = at.iy[1] * width + base;
-    row[2] = at.iy[2] * width + base;
-    time[0] = _mm256_set1_pd(at.time[0]);
-    time[1] = _mm256_set1_pd(at.time[1]);
-    time[2] = _mm256_set1_pd(at.time[2]);
+    base = at->ix[1] - 1 < 0 ? 0 : at->ix[1] - 1 > width - 4 ? width - 4 : at->ix[1] - 1;
+    left = at->ix[1] - 1 - base;
+    row[0] = at->iy[0] * width + base;
+    row[1] = at->iy[1] * width + base;
+    row[2] = at->iy[2] * width + base;
+    time[0] = _mm256_set1_pd(at->time[0]);
+    time[1] = _mm256_set1_pd(at->time[1]);
+    time[2] = _mm256_set1_pd(at->time[2]);
     sums.value = sums.along_y = sums.along_z = _mm256_setzero_pd();
-    bf__wide_plane(&at, time, layer, row, 0, &sums);
-    bf__wide_plane(&at, time, layer, row, 1, &sums);
-    bf__wide_plane(&at, time, layer, row, 2, &sums);
-    wx = bf__four(at.wx, left);
-    sx = bf__four(at.sx, left);
+    bf__wide_plane(at, time, layer, row, 0, &sums);
+    bf__wide_plane(at, time, layer, row, 1, &sums);
+    bf__wide_plane(at, time, layer, row, 2, &sums);
+    wx = bf__four(at->wx, left);
+    sx = bf__four(at->sx, left);
     low = _mm256_hadd_pd(_mm256_mul_pd(sums.value, wx), _mm256_mul_pd(sums.value, sx));
     high = _mm256_hadd_pd(_mm256_mul_pd(sums.along_y, wx), _mm256_mul_pd(sums.along_z, wx));
     _mm256_storeu_pd(found, _mm256_add_pd(_mm256_permute2f128_pd(low, high, 0x20),
@@ -1187,16 +1184,21 @@ static double bf__sum(const bf_field *field, const bf__place *at, double gradien
     return value;
 }
 
+static double bf__sum_at(const bf_field *field, const bf__place *at, double gradient[3])
+{
+#ifdef BF__WIDE
+    if (field->wide) return bf__wide_sum(field, at, gradient);
+#endif
+    return bf__sum(field, at, gradient);
+}
+
 /* Distance, and gradient, at a point whose numbers are finite. */
 static double bf__at(const bf_field *field, int structure, const double point_mm[3], double phase,
                      double gradient[3])
 {
     bf__place at;
-#ifdef BF__WIDE
-    if (field->wide) return bf__wide_at(field, structure, point_mm, phase, gradient);
-#endif
     bf__locate(field, structure, point_mm, phase, &at);
-    return bf__sum(field, &at, gradient);
+    return bf__sum_at(field, &at, gradient);
 }
 
 static double bf__height(const bf_fixture_part *law, double distance_mm)
@@ -1293,7 +1295,8 @@ enum {
     BF__BINS = 4096,       /* into no more than this they are sorted */
     BF__CACHE = 1 << 19,   /* bytes of coefficients that the questions of a bin may ask for */
     BF__LINE = 64,         /* bytes that the processor reads at a time */
-    BF__MANY_LINES = 16    /* the most that are fetched ahead with one question */
+    BF__MANY_LINES = 16,   /* the most that are fetched ahead with one question */
+    BF__AHEAD = 16         /* how many steps ahead a question is located */
 };
 
 /* Answer the question in a note (x, y, z, phase) in its place: distance and gradient, or force. */
@@ -1420,21 +1423,53 @@ static void bf__answer_sorted(bf__batch *batch, double *notes)
         bf__write(batch, n, notes + 4 * (size_t)end[(int)batch->first[stride * n]]++);
 }
 
-static bf_status bf__answer_all(bf__batch *batch, double *scratch)
+/* Bring the coefficients of a place into the cache. Inlined, for GCC leaves out calls of functions that
+ * only fetch. */
+BF__INLINE void bf__expect(const bf_field *field, const bf__place *at)
 {
-    size_t n;
-    if (scratch && batch->count > 0xffffffffu) return BF_WRONG_SIZE;
-    if (scratch && batch->count >= BF__FEW && !bf__follow(batch)) {
-        bf__answer_sorted(batch, scratch);
-        return BF_OK;
-    }
+    ptrdiff_t width = field->shape[0], layer = width * field->shape[1];
+    int phase, b, c;
+    for (phase = 0; phase < 3; phase++)
+        for (c = 0; c < 3; c++) {
+            const float *plane = at->phase[phase] + at->iz[c] * layer + at->ix[0];
+            for (b = 0; b < 3; b++) bf__fetch(plane + at->iy[b] * width);
+        }
+}
+
+static int bf__same(const bf__place *a, const bf__place *b)
+{
+    return a->ix[1] == b->ix[1] && a->iy[1] == b->iy[1] && a->iz[1] == b->iz[1] && a->phase[1] == b->phase[1];
+}
+
+static void bf__place_of(const bf__batch *batch, size_t n, bf__place *at)
+{
+    bf__locate(batch->field, batch->structure, batch->points_mm + 3 * n, bf__when(batch, n), at);
+}
+
+/* Questions in their order. Each is located some steps ahead of its answer, and where it asks for other
+ * coefficients than the one before, these are fetched meanwhile. */
+static void bf__answer_path(const bf__batch *batch)
+{
+    bf__place ring[BF__AHEAD];
+    size_t n, ahead = 0;
     for (n = 0; n < batch->count; n++) {
-        const double *point_mm = batch->points_mm + 3 * n;
-        double slope[3], *to = batch->law ? slope : batch->rest + 3 * n;
-        double distance = bf__at(batch->field, batch->structure, point_mm, bf__when(batch, n), to);
+        double slope[3], *to = batch->law ? slope : batch->rest + 3 * n, distance;
+        for (; ahead < batch->count && ahead < n + BF__AHEAD; ahead++) {
+            bf__place *at = ring + ahead % BF__AHEAD;
+            bf__place_of(batch, ahead, at);
+            if (ahead == 0 || !bf__same(at, ring + (ahead - 1) % BF__AHEAD)) bf__expect(batch->field, at);
+        }
+        distance = bf__sum_at(batch->field, ring + n % BF__AHEAD, to);
         if (batch->law) bf__push(batch->law, distance, slope, batch->first + 3 * n);
         else batch->first[n] = distance;
     }
+}
+
+static bf_status bf__answer_all(bf__batch *batch, double *scratch)
+{
+    if (scratch && batch->count > 0xffffffffu) return BF_WRONG_SIZE;
+    if (scratch && batch->count >= BF__FEW && !bf__follow(batch)) bf__answer_sorted(batch, scratch);
+    else bf__answer_path(batch);
     return BF_OK;
 }
 
