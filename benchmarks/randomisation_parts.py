@@ -1,8 +1,9 @@
 """What each part of the randomisation is worth: the ablation table of docs/segmentation-model.md.
 
-    python benchmarks/randomisation_parts.py OUT [--pool FOLDER] [--steps 1500] [--patients 4]
+    python benchmarks/randomisation_parts.py OUT --start training/heart.pt --pool training/pool
 
-Trains one short network with all parts, and one without each of them, on the same hearts and
+Trains a network on with all parts, and one without each of them, from the same weights (those of
+the first run of ``make train``, say, which is what makes 500 steps enough), on the same hearts and
 seed; then labels stacks of hearts that none of them saw: the phantom's, as its own simulator
 renders them, and those of another anatomy and renderer (tests/outside_heart.py). Prints the mean
 Dice of each structure. Networks that are there already are used again. Needs PyTorch.
@@ -41,12 +42,13 @@ SEED = 501
 """Of the first stack; none of these hearts is in a training pool, which has its own streams."""
 
 
-def train_without(part: str | None, out: Path, pool: Path, steps: int) -> Path:
+def train_without(part: str | None, out: Path, pool: Path, start: Path | None, steps: int) -> Path:
     """Weights of a network trained without one part, made if they are missing."""
     folder = out / f"without-{part or 'nothing'}"
     if not (folder / "heart.onnx").exists():
         command = [sys.executable, "-m", "data_synth.training", "--out", str(folder)]
         command += ["--pool", str(pool), "--steps", str(steps), "--export-minutes", "1e9"]
+        command += ["--start", str(start), "--learning-rate", "1e-3"] if start else []
         command += ["--without", part] if part else []
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return folder / "heart.onnx"
@@ -92,7 +94,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--pool", type=Path, help="hearts to train on; made in OUT if not given")
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--start", type=Path, help="heart.pt to go on from; else random weights")
+    parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--patients", type=int, default=6)
     options = parser.parse_args()
     sets = [
@@ -103,9 +106,8 @@ def main() -> None:
     print("| without | " + " | ".join(columns) + " |")
     print("|---" * (1 + len(columns)) + "|")
     for part in (None, *(one.name for one in fields(Parts))):
-        weights = train_without(
-            part, options.out, options.pool or options.out / "pool", options.steps
-        )
+        pool = options.pool or options.out / "pool"
+        weights = train_without(part, options.out, pool, options.start, options.steps)
         values = np.concatenate([mean_overlaps(weights, stacks) for stacks in sets])
         row = " | ".join(f"{value:.3f}" for value in values)
         print(f"| {part or 'nothing'} | {row} |", flush=True)
