@@ -1,6 +1,7 @@
 """The main job from real files on disk: a study goes in, a force field comes out.
 
-The study has few phases so that the tests are quick; nothing else is made easier.
+The study has few phases and the field coarse nodes, so that the tests are quick; nothing else is
+made easier.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pipeline.geometry import Float
 PHASES = 8
 
 STUDY_CONFIG = f"mr: {{phases: {PHASES}}}\n"
+RUN_CONFIG = "bake: {spacing_mm: 2.5}\n"
 
 
 def beatfield(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -46,7 +48,9 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pipeline")
     (root / "phantom.yaml").write_text(STUDY_CONFIG)
     done("synth", root / "studies", "--seed", 5, "--config", root / "phantom.yaml")
-    done("run", root / "studies" / "patient-0001", "--out", root / "out")
+    (root / "run.yaml").write_text(RUN_CONFIG)
+    study = root / "studies" / "patient-0001"
+    done("run", study, "--out", root / "out", "--config", root / "run.yaml")
     return root
 
 
@@ -195,7 +199,8 @@ def test_the_report_needs_no_other_file(products: Path) -> None:
 def test_a_second_run_changes_nothing(work: Path, products: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in products.rglob("*") if path.is_file()}
     clock = time.perf_counter()
-    said = beatfield("run", work / "studies" / "patient-0001", "--out", work / "out")
+    study = work / "studies" / "patient-0001"
+    said = beatfield("run", study, "--out", work / "out", "--config", work / "run.yaml")
     assert said.returncode == 0
     assert said.stderr.count("unchanged") == 7
     assert time.perf_counter() - clock < 30
@@ -213,7 +218,8 @@ def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(work: Path, produ
     study = made / "patient-0001"
     shutil.rmtree(study / "truth")
     (study / "study.yaml").unlink()
-    command = [sys.executable, "-m", "pipeline", "run", str(study), "--out", str(work / "only")]
+    run = ["run", str(study), "--out", str(work / "only"), "--config", str(work / "run.yaml")]
+    command = [sys.executable, "-m", "pipeline", *run]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         for line in process.stderr:
@@ -225,7 +231,7 @@ def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(work: Path, produ
     assert (found / "ingest" / "cine.nii.gz").exists()
     assert not (found / "segment").exists()
 
-    said = beatfield("run", study, "--out", work / "only")
+    said = beatfield(*run)
 
     assert said.returncode == 0, said.stderr
     assert "ingest    unchanged" in said.stderr
@@ -248,7 +254,7 @@ def test_a_users_own_surfaces_bake_the_same_field(work: Path, products: Path) ->
     (folder / "phases.json").write_text(
         json.dumps({"phases": timing["phases"], "rr_s": timing["rr_s"]})
     )
-    done("bake", "--surfaces", folder, "--out", work / "own-out")
+    done("bake", "--surfaces", folder, "--out", work / "own-out", "--config", work / "run.yaml")
     own = work / "own-out" / "field.zarr"
     chunk = "distance/epicardium/c/2/0/0/0"
     assert (own / chunk).read_bytes() == (products / "bake" / "field.zarr" / chunk).read_bytes()
@@ -285,6 +291,7 @@ def test_an_ecg_that_does_not_cover_the_images_is_refused(
     data.write_bytes(data.read_bytes()[: samples * int(count) * 2])
     out = tmp_path / "out"
     shutil.copytree(products, out / "patient-0001")
-    said = beatfield("run", study, "--out", out, "--until", "register")
+    config = work / "run.yaml"
+    said = beatfield("run", study, "--out", out, "--until", "register", "--config", config)
     assert said.returncode == 2
     assert words in said.stderr
