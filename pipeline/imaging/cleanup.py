@@ -125,7 +125,9 @@ def clean_probability(
     _join_auricle(part)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
-    part[:, 1:] *= _largest_body((labels > 0) | enclosed)[:, None]
+    whole = (labels > 0) | enclosed
+    # Beside the body what is less probable than the background stays: it tells where borders lie.
+    part[:, 1:] *= ~(whole & ~_largest_body(whole))[:, None]
     part[:, 0] *= ~enclosed
     # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
     _smooth_cavity(part, pixel_mm)

@@ -30,12 +30,6 @@ CAP_STEP_MM = 1.5
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
-DECIDED = 0.5
-"""By this much a class is more probable than every other where it is taken for certain. The network
-doubts a wall up to its outer edge, and beyond it no more: with the probability itself, the line
-from 0.6 just inside to 0.05 just outside would cross 0.5 next to the inner pixel, and all that
-lies against the background come out too small."""
-
 EDGE_PX = 0.8
 """Standard deviation, pixels, by which class margins are smoothed: what they decide has stairs."""
 
@@ -155,12 +149,11 @@ def class_margins(probability: Float32) -> Float32:
     Returns
     -------
     (class, row, column) array
-        What can be resampled, where the probability itself would move borders (`DECIDED`).
+        What can be resampled: a probability has no border of its own where three classes meet.
     """
     second, first = np.partition(probability, -2, axis=0)[-2:]
     rival = np.where(probability >= first, second, first)
-    decided = np.clip((probability - rival) / np.float32(DECIDED), -1, 1)
-    return np.stack([cv2.GaussianBlur(one, (0, 0), EDGE_PX) for one in decided])
+    return np.stack([cv2.GaussianBlur(one, (0, 0), EDGE_PX) for one in probability - rival])
 
 
 def _magnified(
