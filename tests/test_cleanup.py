@@ -31,6 +31,24 @@ def test_a_heart_without_faults_is_left_as_it_is():
     np.testing.assert_array_equal(cleaned(heart), heart)
 
 
+def test_what_is_less_probable_than_the_background_stays_beside_the_body():
+    """Borders lie where probabilities cross: what is taken away outside would move them inwards."""
+    chance = 1 / (1 + np.exp((RADIUS - 22) / 0.7))
+    soft = one_hot(np.stack([ring()] * 3))
+    soft[:, MUSCLE] = np.where(RADIUS >= 14, chance, soft[:, MUSCLE])
+    soft[:, 0] = np.where(RADIUS >= 14, 1 - chance, soft[:, 0])
+    soft[:, [CAVITY, RV, ATRIUM, 5, 6]] *= RADIUS < 14
+    soft /= soft.sum(axis=1, keepdims=True)
+    found = clean_probability(soft, pixel_mm=PIXEL_MM)
+    np.testing.assert_allclose(found[:, :, RADIUS > 16], soft[:, :, RADIUS > 16], atol=1e-6)
+
+
+def test_an_island_is_taken_away_and_the_body_left():
+    heart = np.stack([ring()] * 3)
+    heart[:, 2:8, 2:8] = ATRIUM
+    np.testing.assert_array_equal(cleaned(heart), np.stack([ring()] * 3))
+
+
 def test_papillary_muscles_are_drawn_inside_the_cavity():
     smooth = np.stack([ring()] * 3)
     heart = smooth.copy()
