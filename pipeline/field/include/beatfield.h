@@ -1209,7 +1209,8 @@ static double bf__height(const bf_fixture_part *law, double distance_mm)
     s = q * q / (2 * law->delta_mm * law->delta_mm);
     for (; m; m >>= 1, s *= s)
         if (m & 1) power *= s;
-    return -expm1(-power);
+    /* exp(-40) is less than what a double can be short of 1. */
+    return power > 40 ? 1 : -expm1(-power);
 }
 
 /* The force where the distance and its gradient are known. */
