@@ -5,8 +5,9 @@
 Trains a network on with all parts, and one without each of them, from the same weights (those of
 the first run of ``make train``, say, which is what makes 500 steps enough), on the same hearts and
 seed; then labels stacks of hearts that none of them saw: the phantom's, as its own simulator
-renders them, and those of another anatomy and renderer (tests/outside_heart.py). Prints the mean
-Dice of each structure. Networks that are there already are used again. Needs PyTorch.
+renders them, and those of another anatomy and renderer (tests/outside_heart.py). Prints how many
+of them were refused, and the mean Dice of each structure in the others. Networks that are there
+already are used again. Needs PyTorch.
 """
 
 from __future__ import annotations
@@ -71,22 +72,25 @@ def outside_stack(number: int) -> Stack:
     return seen.cine, seen.labels
 
 
-def overlaps(stack: Stack) -> list[float]:
-    """Dice of every structure over all slices and phases; 0 where no heart is found."""
+def overlaps(stack: Stack) -> list[float] | None:
+    """Dice of every structure over all slices and phases; None for a stack that is refused."""
     cine, truth = stack
     try:
         found = segment_cine(cine, SegmentSettings(min_confidence=0)).labels
     except StageError:
-        return [0.0] * len(LABELS)
+        return None
     pairs = [(found == value, truth == value) for value in LABELS.values()]
     return [2 * float((a & b).sum()) / max(float(a.sum() + b.sum()), 1.0) for a, b in pairs]
 
 
-def mean_overlaps(weights: Path, stacks: list[Stack]) -> npt.NDArray[np.float64]:
-    """Mean Dice ``(structure,)`` of the pipeline with other weights than its own."""
+def row_of(weights: Path, stacks: list[Stack]) -> str:
+    """Stacks refused by the pipeline with other weights than its own, and its mean Dice."""
     network.WEIGHTS = weights
     network.load_network.cache_clear()
-    return np.asarray([overlaps(stack) for stack in stacks]).mean(axis=0)
+    each = [overlaps(stack) for stack in stacks]
+    kept = np.array([one for one in each if one is not None]).reshape(-1, len(LABELS))
+    means = kept.mean(axis=0) if len(kept) else np.full(len(LABELS), np.nan)
+    return " | ".join([str(len(each) - len(kept)), *(f"{value:.3f}" for value in means)])
 
 
 def main() -> None:
@@ -102,15 +106,16 @@ def main() -> None:
         [make(number) for number in range(options.patients)]
         for make in (phantom_stack, outside_stack)
     ]
-    columns = [f"{name}, {kind}" for kind in ("phantom", "outside") for name in LABELS]
+    columns = [
+        f"{name}, {kind}" for kind in ("phantom", "outside") for name in ("refused", *LABELS)
+    ]
     print("| without | " + " | ".join(columns) + " |")
     print("|---" * (1 + len(columns)) + "|")
     for part in (None, *(one.name for one in fields(Parts))):
         pool = options.pool or options.out / "pool"
         weights = train_without(part, options.out, pool, options.start, options.steps)
-        values = np.concatenate([mean_overlaps(weights, stacks) for stacks in sets])
-        row = " | ".join(f"{value:.3f}" for value in values)
-        print(f"| {part or 'nothing'} | {row} |", flush=True)
+        cells = " | ".join(row_of(weights, stacks) for stacks in sets)
+        print(f"| {part or 'nothing'} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":
