@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, MovingSurface
+from pipeline.imaging.cine import Cine
 from pipeline.registration.frames import (
     Lattice,
     Samples,
@@ -157,6 +158,7 @@ def prepare_follower(
     surfaces: Mapping[str, MovingSurface],
     registered: Registration,
     settings: RegisterSettings | None = None,
+    cine: Cine | None = None,
 ) -> tuple[Follower, LiveState, list[Lattice]]:
     """What is needed to follow a registration, from what it was made with.
 
@@ -172,7 +174,7 @@ def prepare_follower(
     """
     settings = settings or RegisterSettings()
     pose = registered.mr_from_tracker
-    search = prepare_search(phases, surfaces, pose, settings)
+    search = prepare_search(phases, surfaces, pose, settings, cine)
     level = search.fine_level(sweeps)
     good = np.flatnonzero(registered.valid[level.samples.number])
     level = level.only(good).thinned(settings.max_frames)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry import Float, Integer, MovingSurface
+from pipeline.imaging.cine import Cine
 from pipeline.registration.frames import Samples, TrackedSweep, choose, sample_frames
 from pipeline.registration.pose_search import (
     Pivot,
@@ -24,11 +25,13 @@ from pipeline.registration.tissue_map import TissueMap, blurred, cavities_of, dr
 # The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
 _COARSE_BLUR_MM = 5.0
 _COARSE_SPACING_MM = 9.0
-# From far away, whole chambers are to be found: only what is wider than they are is trend.
-_COARSE_TREND_MM = 60.0
+# Whole chambers are to be found, but what is wider than they are is mostly shadow and noise that
+# rises with depth: left in, it draws the heart out of the picture.
+_COARSE_TREND_MM = 35.0
 _COARSE_FRAMES = 24
-# Optima of the rough level that are told apart at the fine one, and by how many frames.
-_RIVALS = 3
+# Optima of the rough level that are compared at the fine one, how many of them climb there, and by
+# how many frames: where noise is strong the right one is often not the best at the rough level.
+_RIVALS, _FINALISTS = 8, 3
 _RIVAL_FRAMES = 16
 # Millimetres or degrees from the best pose at which another is another answer.
 _ELSEWHERE = 10.0
@@ -137,7 +140,8 @@ class Search:
         )
         fine = self.fine_level(sweeps)
         few = fine.thinned(_RIVAL_FRAMES)
-        refined = [climb(few.score, rival, self.pivot, flatness=4e-3) for rival in rivals]
+        finalists = sorted(rivals, key=few.score, reverse=True)[:_FINALISTS]
+        refined = [climb(few.score, rival, self.pivot, flatness=4e-3) for rival in finalists]
         fine = fine.thinned(self.settings.max_frames)
         pose = climb(fine.score, max(refined, key=fine.score), self.pivot)
         elsewhere = [
@@ -153,15 +157,18 @@ def prepare_search(
     surfaces: Mapping[str, MovingSurface],
     start: Float | None,
     settings: RegisterSettings,
+    cine: Cine | None = None,
 ) -> Search:
     """Draw the model, rough and fine.
+
+    ``cine``: what the surfaces were found in, for the muscle inside the cavities.
 
     Raises
     ------
     InputError
-        When there is no cavity, or the surfaces have not the same phases.
+        When there is no cavity, or surfaces and cine have not the same phases.
     """
-    tissue = draw_tissue(surfaces, settings.grid_mm)
+    tissue = draw_tissue(surfaces, settings.grid_mm, cine)
     pivot = pivot_of(cavities_of(surfaces))
     coarse = blurred(tissue, _COARSE_BLUR_MM)
     fine = blurred(tissue, settings.smoothing_mm)

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
+from pipeline.imaging.cine import Cine
 from pipeline.registration.breathing import follow_breath
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
@@ -120,6 +121,7 @@ def register(
     settings: RegisterSettings | None = None,
     progress: Progress | None = None,
     timing: Timing | None = None,
+    cine: Cine | None = None,
 ) -> Registration:
     """Find ``mr_from_tracker`` from tracked frames, their phases and the moving surfaces.
 
@@ -135,6 +137,9 @@ def register(
     timing
         What the phases were made from, for ``clock_offset`` of the settings: how far the frames'
         clock is off the ECG's is estimated, and taken off where that is asked for. None: not.
+    cine
+        What the surfaces were found in, of the same phases: it shows the muscle inside the
+        ventricles that their smooth surfaces count to the blood. None: that is not looked at.
 
     Raises
     ------
@@ -145,7 +150,7 @@ def register(
         When the verdict is worse than the settings accept.
     """
     settings = settings or RegisterSettings()
-    found = find(sweeps, phases, surfaces, start, settings, progress, timing)
+    found = find(sweeps, phases, surfaces, start, settings, progress, timing, cine)
     if found.verdict == "failed":
         raise StageError(found.reason)
     if found.verdict == "doubtful" and settings.accept == "good":
@@ -161,6 +166,7 @@ def find(
     settings: RegisterSettings,
     progress: Progress | None = None,
     timing: Timing | None = None,
+    cine: Cine | None = None,
 ) -> Registration:
     """As `register`, but a failed registration is returned with its verdict and its reason.
 
@@ -173,7 +179,7 @@ def find(
     if start is not None:
         require_rigid(start, "initial mr_from_tracker")
     _require_frames(sweeps, phases, settings)
-    search = prepare_search(phases, surfaces, start, settings)
+    search = prepare_search(phases, surfaces, start, settings, cine)
     tell(1, _STEPS)
     _require_heart_in_view(search.coarse_level(sweeps), search)
     best = search.best(sweeps)

@@ -17,6 +17,8 @@ from scipy.ndimage import gaussian_filter
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
+from pipeline.imaging.cine import Cine
+from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
 
 BLOOD = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium", "aorta")
 """The structures that hold blood."""
@@ -41,24 +43,50 @@ class TissueMap:
     """Where the nodes are, in LPS millimetres."""
 
 
-def draw_tissue(surfaces: Mapping[str, MovingSurface], spacing_mm: float) -> TissueMap:
+def draw_tissue(
+    surfaces: Mapping[str, MovingSurface], spacing_mm: float, cine: Cine | None = None
+) -> TissueMap:
     """Blood and walls on a grid that holds all cavities in all phases with a margin.
+
+    Parameters
+    ----------
+    cine
+        What the surfaces were found in: what it shows of muscle inside the ventricles is no blood
+        (`pipeline.registration.cavity_muscle`). None, or no epicardium to tell the grey of muscle
+        by: the cavities are all blood.
 
     Raises
     ------
     InputError
-        When there is no cavity, or the surfaces have not the same phases.
+        When there is no cavity, or surfaces and cine have not the same phases.
     """
     cavities = cavities_of(surfaces)
     phases = cavities[0].phases
+    names = [name for name in BLOOD if name in surfaces]
     grid = _grid_around(cavities, spacing_mm)
     share = np.empty((len(phases), *grid.shape, 2), dtype=np.float32)
+    seen = None if cine is None else CineOnGrid.of(cine, phases, grid)
+    grey = None if seen is None else _grey_of_muscle(seen, surfaces, names, grid)
     for index in range(len(phases)):
-        blood = np.minimum(sum(coverage(cavity.at(index), grid) for cavity in cavities), 1)
+        covered = {name: coverage(surfaces[name].at(index), grid) for name in names}
+        blood = np.minimum(sum(covered.values()), 1)
+        if seen is not None and grey is not None:
+            ventricles = np.minimum(sum(covered[name] for name in names if name in VENTRICLES), 1)
+            blood = blood - seen.muscle_inside(index, blood, ventricles, grey)
         soft = gaussian_filter(blood, _WALL_MM / spacing_mm, mode="constant")
         share[index, ..., 0] = blood
         share[index, ..., 1] = 4 * soft * (1 - soft)
     return TissueMap(share, phases, grid)
+
+
+def _grey_of_muscle(
+    seen: CineOnGrid, surfaces: Mapping[str, MovingSurface], names: Sequence[str], grid: Grid
+) -> float | None:
+    """Grey of the left ventricle's wall in the cine's first phase; None where that is unknown."""
+    if "epicardium" not in surfaces or not any(name in VENTRICLES for name in names):
+        return None
+    blood = np.minimum(sum(coverage(surfaces[name].at(0), grid) for name in names), 1)
+    return seen.grey_of_muscle(0, coverage(surfaces["epicardium"].at(0), grid), blood)
 
 
 def cavities_of(surfaces: Mapping[str, MovingSurface]) -> list[MovingSurface]:

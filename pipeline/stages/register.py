@@ -11,7 +11,14 @@ from pipeline.geometry import Float, MovingSurface, require_rigid
 from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, read_sweep
 from pipeline.job import Job, Skipped
-from pipeline.products import FrameRow, read_surfaces, read_table, write_frames, write_table
+from pipeline.products import (
+    FrameRow,
+    read_cine,
+    read_surfaces,
+    read_table,
+    write_frames,
+    write_table,
+)
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.space import Registration, register
 from pipeline.registration.time import detect_r_peaks, summarise_rr
@@ -65,8 +72,9 @@ def _registered(
 ) -> Registration:
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
+    cine = read_cine(job.products / "ingest")
     try:
-        return register(sweeps, phases, surfaces, start, settings, job.progress, timing)
+        return register(sweeps, phases, surfaces, start, settings, job.progress, timing, cine)
     except StageError as error:
         if settings.on_failure == "stop":
             raise
