@@ -35,7 +35,8 @@ from data_synth.study import write_study
 LOWEST_SNR, HIGHEST_SNR = 10.0, 40.0
 GOLDEN = (5**0.5 - 1) / 2
 
-QUICK_FIELD = {
+QUICK_FIELD: dict[str, Any] = {
+    "bake": {"spacing_mm": 4.0, "fit_rounds": 0, "bounds": {"surface_error_p99_spacings": 1.0}},
     "fixtures": {
         "epicardium_guidance": {
             "structure": "epicardium",
@@ -45,9 +46,9 @@ QUICK_FIELD = {
             "m": 2,
             "f_max_n": 2.0,
         }
-    }
+    },
 }
-"""One fixture instead of three: the field is baked before evaluate, and is not looked at here."""
+"""One coarse fixture: the field is baked before evaluate, and is not looked at here."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def heart():
         ("lv_endocardium", "base", lambda s, t: (s.lv_radius, 0, -0.05 * s.lv_length)),
         ("rv_endocardium", "outflow", lambda s, t: t.outflow[-1, :3]),
         ("left_atrium", "appendage", lambda s, t: t.appendage[-1, :3]),
-        ("left_atrium", "stubs of the veins", lambda s, t: t.veins[2, 1, :3]),
+        ("left_atrium", places.STUBS, lambda s, t: t.veins[2, 1, :3]),
         ("left_atrium", "roof", lambda s, t: (s.la_x, s.la_y, s.la_z + s.la_radius_z)),
         ("right_atrium", "valve plane", lambda s, t: (s.ra_x, s.ra_y, 1.0)),
         ("aorta", "end", lambda s, t: t.aorta[-1, :3]),
@@ -69,8 +69,9 @@ def test_shares_and_signs_are_those_of_the_points():
     assert wall == ["aorta", "wall", "50 %", "0.00 %", "0.00 %", "0.00", "+0.00"]
 
 
-def test_what_no_slice_shows_is_left_out_of_the_distances_below():
-    lies = np.array(["wall"] * 50 + [places.BEYOND] * 50)
+@pytest.mark.parametrize("unknown", [places.BEYOND, places.STUBS])
+def test_what_no_image_tells_is_left_out_of_the_distances(unknown):
+    lies = np.array(["wall"] * 50 + [unknown] * 50)
     one = found_and_true(np.array([1.0] * 50 + [-19.0] * 50), lies)
-    mean_mm, far_mm = places.below_roof([one])
+    mean_mm, far_mm = places.where_images_tell([one])
     np.testing.assert_allclose([mean_mm, far_mm], 1.0)
