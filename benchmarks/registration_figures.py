@@ -263,7 +263,7 @@ def thresholds(results: list[dict[str, Any]]) -> list[str]:
     that are even, to choose by, and odd, to see whether the choice holds."""
     text = ["| good_tre_mm | even seeds: good | under 2 mm | odd seeds: good | under 2 mm |"]
     text.append("|---|---|---|---|---|")
-    for limit_mm in np.arange(1.2, 2.01, 0.1):
+    for limit_mm in np.arange(1.5, 2.41, 0.1):
         cells = [f"{limit_mm:.1f}"]
         for odd in (0, 1):
             means = [

@@ -121,10 +121,25 @@ def test_expected_error_is_that_of_drawn_poses(seed):
 
 def test_floor_alone_gives_its_own_error_at_the_centre_and_at_the_lever():
     """sqrt(3) e at the centre; one lever away two rotations add to it: sqrt(5) e."""
-    floor = floor_of(0.5, PIVOT)
+    floor = floor_of(0.5, 7.0 * np.eye(6), PIVOT)
     points = PIVOT.centre_mm + np.array([[0, 0, 0], [PIVOT.lever_mm, 0, 0]])
     expected = expected_tre_mm(floor, PIVOT.centre_mm, points)
     np.testing.assert_allclose(expected, 0.5 * np.sqrt([3, 5]))
+
+
+def test_floor_reaches_further_where_the_frames_hold_the_pose_less():
+    """A direction of a quarter of the mean curvature: twice the error; of all directions together
+    the curvature says nothing, so its unit does not count."""
+    bending = np.diag([1.0, 1.0, 1.0, 1.0, 0.25, 1.75])
+    floor = in_millimetres(floor_of(0.5, bending, PIVOT))
+    np.testing.assert_allclose(floor, in_millimetres(floor_of(0.5, 9 * bending, PIVOT)))
+    np.testing.assert_allclose(np.sqrt(np.diag(floor))[:5], [0.5, 0.5, 0.5, 0.5, 1.0])
+
+
+def in_millimetres(covariance):
+    """Covariance of shift and rotation vector as that of arcs at the pivot's lever."""
+    scale = np.repeat([1.0, PIVOT.lever_mm], 3)
+    return covariance * np.outer(scale, scale)
 
 
 def test_motion_between_poses_is_the_step_that_was_made():

@@ -289,7 +289,8 @@ def _covariance(found: _Found, search: Search, sizes: Sequence[int]) -> Float:
     judged = judged.thinned(search.settings.max_frames)
     curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
     spread = in_radians(sandwich(curvature, _sweep_of(judged, sizes)), search.pivot)
-    return np.asarray(spread + floor_of(search.settings.model_error_mm, search.pivot))
+    floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
+    return np.asarray(spread + floor)
 
 
 def _summarise(

@@ -106,10 +106,14 @@ def in_radians(covariance_mm2: Float, pivot: Pivot) -> Float:
     return np.asarray(covariance_mm2 * np.outer(scale, scale))
 
 
-def floor_of(error_mm: float, pivot: Pivot) -> Float:
-    """Covariance, mm and rad, of an error that all frames share: as large in shift along each
-    axis as in rotation about each axis at the pivot's lever."""
-    return in_radians(error_mm**2 * np.eye(6), pivot)
+def floor_of(error_mm: float, bending: Float, pivot: Pivot) -> Float:
+    """Covariance, mm and rad, of an error that all frames share, such as that of the surfaces.
+
+    Borders that lie ``error_mm`` off draw the pose the further, the less the frames hold it in a
+    direction: a direction of mean curvature by as much, one of a quarter of it by twice as much.
+    """
+    relative = bending / (np.trace(bending) / len(bending))
+    return in_radians(error_mm**2 * _inverse(relative), pivot)
 
 
 def expected_tre_mm(covariance: Float, centre_mm: Float, points_mm: Float) -> Float:
