@@ -56,18 +56,26 @@ static int tank(double level_mj, double capacity_mj)
     return 0;
 }
 
+/* Whether a force that a server might render by mistake is none; then it is made stale again. */
+static int nothing(double force[3])
+{
+    int none = force[0] == 0 && force[1] == 0 && force[2] == 0;
+    force[0] = force[1] = force[2] = 9;
+    return none;
+}
+
 static int refuse(const bf_field *field)
 {
-    double point[3] = {0, 0, 0}, bad[3] = {0, NAN, 0}, force[3], phases[2] = {0, 0};
+    double point[3] = {0, 0, 0}, bad[3] = {0, NAN, 0}, force[3] = {9, 9, 9}, phases[2] = {0, 0};
     bf_tool none = {NULL, 0, 0, {0, 0, 0}};
     double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-    return !(bf_force(field, -1, point, 0, force) == BF_NO_SUCH_NAME &&
+    return !(bf_force(field, -1, point, 0, force) == BF_NO_SUCH_NAME && nothing(force) &&
              bf_force(field, field->fixtures, point, 0, force) == BF_NO_SUCH_NAME &&
-             bf_force(field, 0, bad, 0, force) == BF_NOT_FINITE &&
-             bf_force(field, 0, point, INFINITY, force) == BF_NOT_FINITE &&
+             bf_force(field, 0, bad, 0, force) == BF_NOT_FINITE && nothing(force) &&
+             bf_force(field, 0, point, INFINITY, force) == BF_NOT_FINITE && nothing(force) &&
              bf_distance(field, 99, point, 0, force, NULL) == BF_NO_SUCH_NAME &&
-             bf_forces(field, 0, 1, point, phases, 2, force, NULL) == BF_WRONG_SIZE &&
-             bf_tool_force(field, 0, &none, identity, 0, 0.1, force, NULL, NULL) == BF_WRONG_SIZE &&
+             bf_forces(field, 0, 1, point, phases, 2, force, NULL) == BF_WRONG_SIZE && nothing(force) &&
+             bf_tool_force(field, 0, &none, identity, 0, 0.1, force, NULL, NULL) == BF_WRONG_SIZE && nothing(force) &&
              bf_structure(field, "none") == -1 && bf_fixture(field, "") == -1);
 }
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from pipeline.errors import InputError
-from pipeline.field import Fixture, ForceField
+from pipeline.field import Fixture, ForceField, kernels
 from pipeline.field.bake import bake_field
 from pipeline.field.manifest import write_manifest
 from pipeline.field.potential import direction_scale, offence, potential, pull
@@ -288,6 +288,10 @@ def test_phases_beside_the_seam_are_places_in_the_cycle(field, tiny):
         (lambda f: f.force_n([[1, 2, 3], [1, np.nan, 3]], 0), "point 1 is not finite"),
         (lambda f: f.force_n([[1, 2, 3]], np.inf), "phase must be finite"),
         (lambda f: f.force_n([[1, 2, 3]], [0.1, 0.2]), "phase must be one number"),
+        (lambda f: f.force_n([[1, "two", 3]], 0), "points must be numbers"),
+        (lambda f: f.force_n([[1, 2, 3], [1, 2]], 0), "points must be numbers"),
+        (lambda f: f.force_at("left", 2, 3, 0), "is not four numbers"),
+        (lambda f: f.force_at(1, 2, 3, 0, ""), "no fixture ''"),
         (lambda f: f.force_n([[1, 2, 3]], 0, "gide"), "no fixture 'gide'; there are guide, stay"),
         (lambda f: f.distance_mm([[1, 2, 3]], 0, "bal"), "no structure 'bal'; there are ball, c"),
     ],
@@ -295,6 +299,16 @@ def test_phases_beside_the_seam_are_places_in_the_cycle(field, tiny):
 def test_wrong_questions_are_refused(field, ask, words):
     with pytest.raises(InputError, match=words):
         ask(field)
+
+
+def test_numbers_of_any_type_are_answered_without_compiling_anew(field):
+    """A compilation takes seconds, in which a hand would be held by a force of long ago."""
+    expected = field.force_at(14.0, 2.0, 1.0, 0.0), field.distance_at(14.0, 2.0, 1.0, 0.0)
+    compiled = len(kernels.force_at.signatures), len(kernels.distance_at.signatures)
+    for kind in (int, np.float32, np.int16, np.array):
+        where = [kind(one) for one in (14, 2, 1, 0)]
+        assert (field.force_at(*where), field.distance_at(*where)) == expected
+    assert (len(kernels.force_at.signatures), len(kernels.distance_at.signatures)) == compiled
 
 
 def test_query_answers_for_every_fixture(path, field):

@@ -7,6 +7,14 @@
 #define BEATFIELD_IMPLEMENTATION
 #include "beatfield.h"
 
+/* A word that is a number and nothing else; not a number (which the field refuses) otherwise. */
+static double number(const char *word)
+{
+    char *end;
+    double value = strtod(word, &end);
+    return end > word && !*end ? value : NAN;
+}
+
 int main(int count, char **words)
 {
     bf_field field;
@@ -22,8 +30,8 @@ int main(int count, char **words)
         fprintf(stderr, "error: %s: %s\n", words[1], bf_text(status));
         return 2;
     }
-    for (n = 0; n < 3; n++) point_mm[n] = atof(words[2 + n]);
-    phase = atof(words[5]);
+    for (n = 0; n < 3; n++) point_mm[n] = number(words[2 + n]);
+    phase = number(words[5]);
     for (n = 0; n < field.fixtures && status == BF_OK; n++) {
         const bf_fixture_part *law = &field.fixture[n];
         status = bf_distance(&field, law->structure, point_mm, phase, &distance_mm, NULL);

@@ -21,6 +21,7 @@ from pipeline.field.files import map_phase, read_metadata, readable_in_fours, re
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
+from pipeline.field.questions import as_phases, as_points, four_floats, not_finite, require_finite
 from pipeline.field.spline import timeline
 from pipeline.field.threads import in_parts
 from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
@@ -155,8 +156,8 @@ class ForceField:
 
     def contains(self, points_mm: npt.ArrayLike) -> Mask:
         """Which of ``(n, 3)`` points lie in the grid."""
-        points = _as_points(points_mm)
-        _require_finite(points)
+        points = as_points(points_mm)
+        require_finite(points)
         inside = (points >= self._grid.origin_mm) & (points <= self._grid.upper_mm)
         return np.asarray(inside.all(axis=1))
 
@@ -214,13 +215,13 @@ class ForceField:
         from pipeline.field.batches import sample_force
 
         self._fixture(fixture)
-        law = self._laws[fixture or self._first]
-        points = _as_points(points_mm)
-        phases = _as_phases(phase, len(points))
+        law = self._laws[self._first if fixture is None else fixture]
+        points = as_points(points_mm)
+        phases = as_phases(phase, len(points))
         force_n = np.empty((len(points), 3))
 
         def ask(part: slice, moments: Float) -> None:
-            _require_finite(points[part], moments, part.start)
+            require_finite(points[part], moments, part.start)
             sample_force(law, points[part], moments, force_n[part])
 
         in_parts(ask, phases, len(points))
@@ -241,9 +242,10 @@ class ForceField:
             addresses = self._addresses[structure or self._fixtures[self._first].structure]
         except KeyError:
             raise self._unknown("structure", structure, self._addresses) from None
-        found: float = kernel(addresses, self._line, self._numbers, x_mm, y_mm, z_mm, phase)[0]
+        where = four_floats(x_mm, y_mm, z_mm, phase)
+        found: float = kernel(addresses, self._line, self._numbers, *where)[0]
         if found != found:
-            raise _not_finite(x_mm, y_mm, z_mm, phase)
+            raise not_finite(x_mm, y_mm, z_mm, phase)
         return found
 
     def force_at(
@@ -258,12 +260,13 @@ class ForceField:
         """
         kernel = self._force_at or self._load()[1]
         try:
-            law = self._laws[fixture or self._first]
+            law = self._laws[self._first if fixture is None else fixture]
         except KeyError:
             raise self._unknown("fixture", fixture, self._laws) from None
-        force_n: tuple[float, float, float] = kernel(*law, x_mm, y_mm, z_mm, phase)
+        where = four_floats(x_mm, y_mm, z_mm, phase)
+        force_n: tuple[float, float, float] = kernel(*law, *where)
         if force_n[0] != force_n[0]:
-            raise _not_finite(x_mm, y_mm, z_mm, phase)
+            raise not_finite(x_mm, y_mm, z_mm, phase)
         return force_n
 
     def tool_force(
@@ -301,7 +304,7 @@ class ForceField:
         if not (bound_n > 0 and math.isfinite(phase)):
             raise InputError(f"bound_n = {bound_n} must be above 0, and phase = {phase} finite")
         try:
-            law = self._laws[fixture or self._first]
+            law = self._laws[self._first if fixture is None else fixture]
         except KeyError:
             raise self._unknown("fixture", fixture, self._laws) from None
         pose = np.ascontiguousarray(mr_from_tool, dtype=np.float64)
@@ -357,44 +360,14 @@ class ForceField:
     ) -> tuple[Float, Float]:
         from pipeline.field.batches import sample
 
-        points = _as_points(points_mm)
-        phases = _as_phases(phase, len(points))
+        points = as_points(points_mm)
+        phases = as_phases(phase, len(points))
         distance_mm, gradient = np.empty(len(points)), np.empty((len(points), 3))
         field = (self._addresses[structure], self._line, self._numbers)
 
         def ask(part: slice, moments: Float) -> None:
-            _require_finite(points[part], moments, part.start)
+            require_finite(points[part], moments, part.start)
             sample(*field, points[part], moments, distance_mm[part], gradient[part])
 
         in_parts(ask, phases, len(points))
         return distance_mm, gradient
-
-
-def _not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
-    return InputError(
-        f"point ({x_mm}, {y_mm}, {z_mm}) mm at phase {phase} is not finite; every number must be"
-    )
-
-
-def _require_finite(points: Float, phases: Float | None = None, first: int = 0) -> None:
-    """Raise InputError unless all numbers are finite; ``first`` is the first point's number."""
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        where = f"point {first + bad} is not finite: {points[bad]}"
-        raise InputError(f"{where}; every coordinate must be mm")
-    if phases is not None and not np.isfinite(phases).all():
-        raise InputError("phase must be finite: a share of the heartbeat, whose fraction counts")
-
-
-def _as_points(points_mm: npt.ArrayLike) -> Float:
-    points = np.ascontiguousarray(points_mm, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points must be (n, 3) in mm, got an array of shape {points.shape}")
-    return points
-
-
-def _as_phases(phase: npt.ArrayLike, count: int) -> Float:
-    phases = np.atleast_1d(np.asarray(phase, dtype=np.float64))
-    if phases.shape not in {(1,), (count,)}:
-        raise InputError(f"phase must be one number or ({count},), got shape {phases.shape}")
-    return phases

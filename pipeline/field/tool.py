@@ -153,7 +153,7 @@ def spread_points(corners_mm: Float, count: int) -> Float:
     return points
 
 
-def read_tool(path: Path) -> Tool:
+def read_tool(path: Path | str) -> Tool:
     """Read a tool's YAML file.
 
     Raises
@@ -163,6 +163,7 @@ def read_tool(path: Path) -> Tool:
     """
     import yaml
 
+    path = Path(path)
     try:
         content = yaml.safe_load(path.read_text())
         if isinstance(content, dict) and "path" in content:

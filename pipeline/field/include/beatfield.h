@@ -121,7 +121,7 @@ bf_status bf_distances(const bf_field *field, int structure, size_t count, const
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential);
 
-/* Force of a fixture on a tool's point, newtons. */
+/* Force of a fixture on a tool's point, newtons. Whatever gives forces gives zeros where it fails. */
 bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
                    double force_n[3]);
 
@@ -207,7 +207,7 @@ const char *bf_text(bf_status status)
     case BF_OK: return "done";
     case BF_CANNOT_READ: return "a file is missing or cannot be read";
     case BF_NOT_A_FIELD: return "no complete field: bake it again";
-    case BF_WRONG_SIZE: return "a file has the wrong size: bake it again";
+    case BF_WRONG_SIZE: return "a size is wrong: a file's (bake it again), or a batch's or tool's (mend the call)";
     case BF_DAMAGED: return "a file is not what the manifest says: bake it again";
     case BF_NO_MEMORY: return "no memory";
     case BF_CANNOT_LOCK: return "pages cannot be locked: raise the limit (ulimit -l)";
@@ -1260,8 +1260,13 @@ bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3],
 {
     double slope[3], distance;
     const bf_fixture_part *law;
-    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
-    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
+    bf_status status = fixture < 0 || fixture >= field->fixtures ? BF_NO_SUCH_NAME
+                       : bf__finite(point_mm, phase)             ? BF_OK
+                                                                 : BF_NOT_FINITE;
+    if (status != BF_OK) {
+        memset(force_n, 0, 3 * sizeof(double));
+        return status;
+    }
     law = &field->fixture[fixture];
     distance = bf__at(field, law->structure, point_mm, phase, slope);
     bf__push(law, distance, slope, force_n);
@@ -1501,9 +1506,13 @@ bf_status bf_forces(const bf_field *field, int fixture, size_t count, const doub
 {
     bf__batch batch;
     bf_status status;
-    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
-    status = bf__askable(count, points_mm, phases, phase_count);
-    if (status != BF_OK) return status;
+    status = fixture < 0 || fixture >= field->fixtures
+                 ? BF_NO_SUCH_NAME
+                 : bf__askable(count, points_mm, phases, phase_count);
+    if (status != BF_OK) {
+        if (count) memset(forces_n, 0, 3 * count * sizeof(double));
+        return status;
+    }
     batch.field = field;
     batch.law = &field->fixture[fixture];
     batch.structure = batch.law->structure;
@@ -1640,6 +1649,8 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     bf__feel feel;
     double total = 0, length;
     int n, stretches;
+    memset(force_n, 0, 3 * sizeof(double));
+    if (torque_nmm) memset(torque_nmm, 0, 3 * sizeof(double));
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
     if (tool->count < 1) return BF_WRONG_SIZE;
     if (!(bound_n > 0) || phase - phase != 0) return BF_NOT_FINITE;

@@ -1,0 +1,69 @@
+"""What a reader may be asked: numbers of the right shape, and errors that say what came."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InputError
+from pipeline.geometry import Float
+
+
+def four_floats(
+    x_mm: float, y_mm: float, z_mm: float, phase: float
+) -> tuple[float, float, float, float]:
+    """The numbers as floats: of any other type, the kernels would be compiled anew for seconds.
+
+    Raises
+    ------
+    InputError
+        When one is no number.
+    """
+    try:
+        return float(x_mm), float(y_mm), float(z_mm), float(phase)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(
+            f"point ({x_mm}, {y_mm}, {z_mm}) at phase {phase} is not four numbers; "
+            "give x, y and z in mm and the phase"
+        ) from None
+
+
+def not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
+    """What to raise when a question's answer is none."""
+    return InputError(
+        f"point ({x_mm}, {y_mm}, {z_mm}) mm at phase {phase} is not finite; every number must be"
+    )
+
+
+def require_finite(points: Float, phases: Float | None = None, first: int = 0) -> None:
+    """Raise InputError unless all numbers are finite; ``first`` is the first point's number."""
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        where = f"point {first + bad} is not finite: {points[bad]}"
+        raise InputError(f"{where}; every coordinate must be mm")
+    if phases is not None and not np.isfinite(phases).all():
+        raise InputError("phase must be finite: a share of the heartbeat, whose fraction counts")
+
+
+def as_numbers(values: npt.ArrayLike, name: str) -> Float:
+    """An array of float64; raises InputError where there is none."""
+    try:
+        return np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers ({error})") from None
+
+
+def as_points(points_mm: npt.ArrayLike) -> Float:
+    """``(n, 3)``; raises InputError for any other shape."""
+    points = as_numbers(points_mm, "points")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points must be (n, 3) in mm, got an array of shape {points.shape}")
+    return points
+
+
+def as_phases(phase: npt.ArrayLike, count: int) -> Float:
+    """``(1,)`` or ``(count,)``; raises InputError for any other shape."""
+    phases = np.atleast_1d(as_numbers(phase, "phase"))
+    if phases.shape not in {(1,), (count,)}:
+        raise InputError(f"phase must be one number or ({count},), got shape {phases.shape}")
+    return phases
