@@ -6,8 +6,8 @@ Trains a network on with all parts, and one without each of them, from the same 
 the first run of ``make train``, say, which is what makes 500 steps enough), on the same hearts and
 seed; then labels stacks of hearts that none of them saw: the phantom's, as its own simulator
 renders them, and those of another anatomy and renderer (tests/outside_heart.py). Prints how many
-of them were refused, and the mean Dice of each structure in the others. Networks that are there
-already are used again. Needs PyTorch.
+of them each network had refused, and the mean Dice of each structure in the stacks that none had.
+Networks that are there already are used again. Needs PyTorch.
 """
 
 from __future__ import annotations
@@ -83,14 +83,19 @@ def overlaps(stack: Stack) -> list[float] | None:
     return [2 * float((a & b).sum()) / max(float(a.sum() + b.sum()), 1.0) for a, b in pairs]
 
 
-def row_of(weights: Path, stacks: list[Stack]) -> str:
-    """Stacks refused by the pipeline with other weights than its own, and its mean Dice."""
+def all_overlaps(weights: Path, stacks: list[Stack]) -> list[list[float] | None]:
+    """Dice of each stack by the pipeline with other weights than its own."""
     network.WEIGHTS = weights
     network.load_network.cache_clear()
-    each = [overlaps(stack) for stack in stacks]
-    kept = np.array([one for one in each if one is not None]).reshape(-1, len(LABELS))
-    means = kept.mean(axis=0) if len(kept) else np.full(len(LABELS), np.nan)
-    return " | ".join([str(len(each) - len(kept)), *(f"{value:.3f}" for value in means)])
+    return [overlaps(stack) for stack in stacks]
+
+
+def cells(found: list[list[float] | None], shared: list[bool]) -> list[str]:
+    """How many stacks were refused, and the mean Dice over those that no network refused."""
+    refused = sum(one is None for one in found)
+    kept = [one for one, used in zip(found, shared, strict=True) if used and one is not None]
+    means = np.mean(kept, axis=0) if kept else np.full(len(LABELS), np.nan)
+    return [str(refused), *(f"{value:.3f}" for value in means)]
 
 
 def main() -> None:
@@ -106,16 +111,20 @@ def main() -> None:
         [make(number) for number in range(options.patients)]
         for make in (phantom_stack, outside_stack)
     ]
-    columns = [
-        f"{name}, {kind}" for kind in ("phantom", "outside") for name in ("refused", *LABELS)
-    ]
-    print("| without | " + " | ".join(columns) + " |")
-    print("|---" * (1 + len(columns)) + "|")
-    for part in (None, *(one.name for one in fields(Parts))):
-        pool = options.pool or options.out / "pool"
+    names = [None, *(one.name for one in fields(Parts))]
+    pool = options.pool or options.out / "pool"
+    found = []
+    for part in names:
         weights = train_without(part, options.out, pool, options.start, options.steps)
-        cells = " | ".join(row_of(weights, stacks) for stacks in sets)
-        print(f"| {part or 'nothing'} | {cells} |", flush=True)
+        found.append([all_overlaps(weights, stacks) for stacks in sets])
+    for number, kind in enumerate(("phantom", "outside")):
+        rows = [one[number] for one in found]
+        shared = [all(each) for each in zip(*rows, strict=True)]
+        print(f"\n{kind}: mean Dice of {sum(shared)} stacks that no network refused\n")
+        print("| without | refused | " + " | ".join(LABELS) + " |")
+        print("|---" * (2 + len(LABELS)) + "|")
+        for part, row in zip(names, rows, strict=True):
+            print(f"| {part or 'nothing'} | " + " | ".join(cells(row, shared)) + " |")
 
 
 if __name__ == "__main__":
