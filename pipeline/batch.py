@@ -18,6 +18,9 @@ from pipeline.errors import InputError
 from pipeline.publish import readable_write_errors
 from pipeline.study import open_study, studies_in
 
+NO_STUDY = "no study"
+"""Status of a folder among the studies that is none; nothing was run, and nothing failed."""
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -25,7 +28,7 @@ class Outcome:
 
     patient: str
     status: str
-    """done, failed (the program said why) or crashed (it could not)."""
+    """done, failed (the program said why), crashed (it could not) or `NO_STUDY`."""
 
     seconds: float
     lv_ejection_fraction: float | None
@@ -42,6 +45,8 @@ def run_batch(
     ended: Callable[[str, str, float], None],
 ) -> list[Outcome]:
     """Run every study below ``studies``; write ``out/batch.csv``; return outcomes by name.
+
+    Folders that are no study are listed among the outcomes, but for hidden ones and ``out``.
 
     Raises
     ------
@@ -64,10 +69,20 @@ def run_batch(
             outcome = finished.result()
             ended(outcome.patient, outcome.status, outcome.seconds)
             outcomes.append(outcome)
+    outcomes += _no_studies(studies, folders, out)
     outcomes.sort(key=lambda outcome: outcome.patient)
     with readable_write_errors(out):
         _write_csv(out / "batch.csv", outcomes)
     return outcomes
+
+
+def _no_studies(studies: Path, folders: Sequence[Path], out: Path) -> list[Outcome]:
+    others = (path for path in studies.iterdir() if path.is_dir() and path not in folders)
+    return [
+        Outcome(path.name, NO_STUDY, 0.0, None, None, None, "has neither cine/ nor study.yaml")
+        for path in others
+        if not path.name.startswith(".") and path.resolve() != out.resolve()
+    ]
 
 
 def _require_different_patients(folders: Sequence[Path]) -> None:

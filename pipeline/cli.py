@@ -186,7 +186,8 @@ def bake(
     from pipeline.config import read_settings
     from pipeline.own_surfaces import bake_own_surfaces
 
-    field = bake_own_surfaces(surfaces, out, read_settings(config), Console().progress)
+    settings = read_settings(config, own_surfaces=True)
+    field = bake_own_surfaces(surfaces, out, settings, Console().progress)
     print(f"field     {field}")
     return 0
 
@@ -202,7 +203,7 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     workers
         How many studies to run at a time.
     """
-    from pipeline.batch import run_batch, table
+    from pipeline.batch import NO_STUDY, run_batch, table
 
     if workers < 1:
         raise InputError(f"--workers {workers}: at least 1 is needed")
@@ -213,7 +214,7 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     outcomes = run_batch(studies, out, workers, config, ended)
     print(table(outcomes))
     print(f"table     {out / 'batch.csv'}")
-    return 0 if all(outcome.status == "done" for outcome in outcomes) else 1
+    return 0 if all(one.status in ("done", NO_STUDY) for one in outcomes) else 1
 
 
 @app.command

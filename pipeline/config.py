@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Self
 
@@ -35,16 +36,33 @@ class Settings(BaseModel):
         return self
 
 
-def read_settings(path: Path | None) -> Settings:
+def read_settings(path: Path | None, *, own_surfaces: bool = False) -> Settings:
     """Read a YAML file over the defaults; without one, the defaults.
+
+    Parameters
+    ----------
+    own_surfaces
+        The surfaces are of one's own: fixtures may name structures that the pipeline never makes.
 
     Raises
     ------
     InputError
-        When the file cannot be read, or a key is unknown or its value wrong: all of them named.
+        When the file cannot be read, a key is unknown or its value wrong (all of them named), or
+        a structure is none that the pipeline makes.
     """
     if path is None:
         return Settings()
+    settings = _settings(path)
+    if not own_surfaces:
+        _require_known_structures(settings, path)
+    return settings
+
+
+def _settings(path: Path) -> Settings:
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such file; copy configs/default.yaml and keep what you change"
+        )
     try:
         content = yaml.safe_load(path.read_text()) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -54,4 +72,24 @@ def read_settings(path: Path | None) -> Settings:
     try:
         return Settings.model_validate(content)
     except ValidationError as error:
-        raise InputError(describe_validation(error, str(path))) from error
+        raise InputError(describe_validation(error, str(path), Settings)) from error
+
+
+def _require_known_structures(settings: Settings, path: Path) -> None:
+    """Refuse a name that only the bake stage, minutes later, would find to be missing."""
+    # The surface stage's libraries are heavy, and settings are read for every command.
+    from pipeline.surface.extraction import STRUCTURES
+
+    named = {f"fixtures.{name}.structure": one.structure for name, one in settings.fixtures.items()}
+    named |= {f"bake.structures.{k}": name for k, name in enumerate(settings.bake.structures)}
+    lines = []
+    for key, name in named.items():
+        if name not in STRUCTURES:
+            near = get_close_matches(name, STRUCTURES, 1)
+            meant = f"did you mean {near[0]}? " if near else ""
+            lines.append(
+                f"{path}: {key}: no structure {name!r}; {meant}the pipeline makes "
+                + ", ".join(STRUCTURES)
+            )
+    if lines:
+        raise InputError("\n".join(lines))

@@ -1,13 +1,14 @@
 """A patient study on disk: what is there, and where.
 
-``study.yaml`` names the files; without it the folders ``cine/``, ``ecg/`` and ``us/`` speak for
-themselves. Nothing here reads an image.
+The folders ``cine/``, ``ecg/`` and ``us/`` speak for themselves; ``study.yaml`` names what lies
+elsewhere, key by key. Nothing here reads an image.
 """
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipeline.errors import InputError
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
+DICOM_ENDINGS = (".dcm", ".ima", "")
 
 
 class _Section(BaseModel):
@@ -99,7 +101,8 @@ def open_study(folder: Path) -> Study:
         folder = inside[0]
     folder = folder.resolve()
     described = folder / "study.yaml"
-    study = _from_yaml(described) if described.exists() else _from_folders(folder)
+    given = _read_yaml(described) if described.exists() else {}
+    study = _understood(folder, given, str(described if given else folder))
     _require_files(study)
     return study
 
@@ -122,32 +125,72 @@ def _no_study_message(folder: Path, inside: list[Path]) -> str:
     return f"{folder}: is no study: it has neither cine/ nor study.yaml"
 
 
-def _from_yaml(path: Path) -> Study:
+def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         raise InputError(f"{path}: cannot be read as YAML ({error})") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: needs keys and values, such as `patient_id: NAME`")
-    base = path.parent
-    content = {"patient_id": base.name, "cine": {"path": "cine"}, **content, "folder": base}
+    return content
+
+
+def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
+    """What the folders hold, each key that is given in its place."""
+    content = {"patient_id": folder.name, **given, "folder": folder}
+    for name, found in (("ecg", _found_ecg(folder)), ("us", _found_us(folder))):
+        content[name] = _overridden(found, given[name]) if name in given else found
+    content["cine"] = _found_cine(folder, given.get("cine", {}))
     try:
         return _absolute(Study.model_validate(content))
     except ValidationError as error:
-        raise InputError(describe_validation(error, str(path))) from error
+        raise InputError(describe_validation(error, where, Study)) from error
 
 
-def describe_validation(error: ValidationError, where: str) -> str:
-    """A validation error as lines that name the file, the key, and what came."""
+def _overridden(found: dict[str, Any] | None, given: Any) -> Any:
+    return {**(found or {}), **given} if isinstance(given, dict) else given
+
+
+def describe_validation(
+    error: ValidationError, where: str, model: type[BaseModel] | None = None
+) -> str:
+    """A validation error as lines that name the file, the key, and what came.
+
+    With the ``model`` that was to be filled, an unknown key is answered with the nearest known.
+    """
     lines = []
     for one in error.errors():
         key = ".".join(str(part) for part in one["loc"]) or "(all)"
         message = one["msg"].removeprefix("Value error, ")
         if one["type"] == "extra_forbidden":
-            message = "unknown key; check its spelling"
+            message = f"unknown key{_instead(one['loc'], model)}"
         came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
         lines.append(f"{where}: {key}: {message}{came}")
     return "\n".join(lines)
+
+
+def _instead(place: tuple[int | str, ...], model: type[BaseModel] | None) -> str:
+    known: Any = model
+    for part in place[:-1]:
+        known = _within(known, part)
+    names = _keys(known) if isinstance(known, type) and issubclass(known, BaseModel) else {}
+    near = get_close_matches(str(place[-1]), names, 1)
+    return f"; did you mean {near[0]}?" if near else "; check its spelling"
+
+
+def _keys(model: type[BaseModel]) -> dict[str, Any]:
+    """Annotations of a model's fields, by the keys under which they are given."""
+    return {one.alias or name: one.annotation for name, one in model.model_fields.items()}
+
+
+def _within(known: Any, key: int | str) -> Any:
+    """The model under one key of a model or of a mapping, or None."""
+    if isinstance(known, type) and issubclass(known, BaseModel):
+        known = _keys(known).get(str(key))
+        models = [one for one in get_args(known) if isinstance(one, type)]
+        is_optional = type(None) in models
+        return models[0] if is_optional else known
+    return get_args(known)[1] if get_origin(known) is dict else None
 
 
 def _absolute(study: Study) -> Study:
@@ -168,27 +211,42 @@ def _absolute(study: Study) -> Study:
     return study.model_copy(update=update)
 
 
-def _from_folders(folder: Path) -> Study:
-    cine = folder / "cine"
-    images = [path for path in _files(cine) if path.name.endswith(NIFTI_ENDINGS)]
+def _found_cine(folder: Path, given: Any) -> Any:
+    """The cine's section: a folder that holds a NIfTI file stands for it, with its timing."""
+    path = given.get("path", "cine") if isinstance(given, dict) else None
+    if not isinstance(path, str):
+        return given
+    cine = folder / path
+    images = [one for one in _files(cine) if one.name.endswith(NIFTI_ENDINGS)]
     if len(images) > 1:
         raise InputError(
             f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}); "
             "one 4D file is needed, or study.yaml that names it under cine.path"
         )
-    timing = cine / "timing.json"
+    if images and cine.is_dir():
+        _require_no_dicom(cine, images[0])
+    timing = images[0].with_name("timing.json") if images else None
+    found = {"timing": timing if timing and timing.exists() else None}
+    return {**found, **given, "path": images[0] if images else cine}
+
+
+def _require_no_dicom(cine: Path, image: Path) -> None:
+    """Refuse a folder in which one NIfTI file would stand for what may be another cine."""
+    for one in _files(cine):
+        if one.suffix.lower() in DICOM_ENDINGS and not one.name.startswith("."):
+            raise InputError(
+                f"{cine}: holds {image.name}, a NIfTI file, and {one.name}, as of DICOM; keep "
+                "one sort there, or name the NIfTI file under cine.path in study.yaml"
+            )
+
+
+def _found_ecg(folder: Path) -> dict[str, Any]:
+    return {name: _record(folder / "ecg" / name) for name in ("mr", "us")}
+
+
+def _found_us(folder: Path) -> dict[str, Any] | None:
     sweeps = tuple(sorted((folder / "us").glob("*.mh[ad]")))
-    us_ecg = _record(folder / "ecg" / "us")
-    return Study(
-        patient_id=folder.name,
-        folder=folder,
-        cine=CineFiles(
-            path=images[0] if images else cine,
-            timing=timing if timing.exists() and images else None,
-        ),
-        ecg=EcgFiles(mr=_record(folder / "ecg" / "mr"), us=us_ecg),
-        us=UltrasoundFiles(sweeps=sweeps) if sweeps else None,
-    )
+    return {"sweeps": sweeps} if sweeps else None
 
 
 def _record(stem: Path) -> Path | None:
@@ -204,6 +262,11 @@ def _record_files(stem: Path | None) -> list[Path]:
 
 
 def _require_files(study: Study) -> None:
+    if study.cine.path == study.folder / "cine" and not study.cine.path.exists():
+        raise InputError(
+            f"{study.folder}: has no cine/; put the cine MR there, or name its place as cine.path "
+            "in study.yaml"
+        )
     missing = [study.cine.path, study.cine.timing, *(study.us.sweeps if study.us else ())]
     for path in missing:
         if path is not None and not path.exists():

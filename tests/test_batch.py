@@ -75,6 +75,25 @@ def test_all_done_is_exit_code_0(studies: Path, tmp_path: Path) -> None:
     assert main(["batch", str(studies), "--out", str(tmp_path / "out"), "--workers", "3"]) == 0
 
 
+def test_a_folder_that_is_no_study_is_listed_and_costs_nothing(
+    studies: Path, tmp_path: Path
+) -> None:
+    for name in ("crashes", "fails", "raises"):
+        os.renames(studies / name, tmp_path / "elsewhere" / name)
+    for name in ("cines/a", ".git"):
+        (studies / name).mkdir(parents=True)
+    out = studies / "products"
+    assert main(["batch", str(studies), "--out", str(out)]) == 0
+    with (out / "batch.csv").open(newline="") as handle:
+        rows = {row["patient"]: row for row in csv.DictReader(handle)}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "cines": "no study",
+        "good": "done",
+        "well": "done",
+    }
+    assert "neither cine/ nor study.yaml" in rows["cines"]["cause"]
+
+
 def test_two_studies_of_one_patient_are_refused(
     studies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,7 +31,7 @@ from pydicom.dataset import FileDataset
 from pipeline.errors import InputError
 from pipeline.geometry import transform_points
 from pipeline.imaging.dicom import read_dicom_cine
-from pipeline.imaging.nifti import read_image, read_nifti_cine, write_image
+from pipeline.imaging.nifti import read_image, read_nifti_cine, read_nifti_views, write_image
 
 
 def test_classic_dicom_is_sorted_by_position_then_trigger_time(tmp_path: Path) -> None:
@@ -211,6 +211,51 @@ def test_nifti_without_timing_is_refused(tmp_path: Path) -> None:
     nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=None)
     with pytest.raises(InputError, match="no trigger times"):
         read_nifti_cine(tmp_path / "cine.nii", None)
+
+
+@pytest.mark.parametrize("step_s", [None, 1.0, 0.16])
+def test_a_given_rr_interval_spreads_the_phases_evenly(
+    tmp_path: Path, step_s: float | None
+) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s)
+    stack = read_nifti_cine(tmp_path / "cine.nii", None, rr_ms=750)
+    np.testing.assert_allclose(stack.cine.phases, np.arange(5) / 5)
+    np.testing.assert_allclose(stack.trigger_times_ms, [[0, 150, 300, 450, 600]] * 4)
+    assert stack.cine.rr_s == pytest.approx(0.75)
+    assert stack.timing_source == "study.yaml"
+
+
+def test_a_timing_file_keeps_its_trigger_times_under_a_given_rr_interval(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]))
+    timing = tmp_path / "timing.json"
+    timing.write_text('{"trigger_times_ms": [0, 100, 300, 400, 700], "rr_ms": 800}')
+    stack = read_nifti_cine(tmp_path / "cine.nii", timing, rr_ms=1000)
+    np.testing.assert_allclose(stack.cine.phases, [0, 0.1, 0.3, 0.4, 0.7])
+
+
+def test_a_time_step_that_is_no_heart_is_explained(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=1.0)
+    words = r"5000 ms = 5 phases x the header's time step of 1000 ms.*give cine\.rr_ms"
+    with pytest.raises(InputError, match=words):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+
+
+@pytest.mark.parametrize("step_s", [None, 1.0])
+def test_a_given_rr_interval_is_that_of_untimed_long_axis_views_too(
+    tmp_path: Path, step_s: float | None
+) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 1, 4), np.int16), np.diag([1, 1, 8, 1.0]))
+    if step_s is not None:
+        image.header.set_xyzt_units("mm", "sec")
+        image.header.set_zooms((1, 1, 8, step_s))
+    nibabel.save(image, tmp_path / "four_chamber.nii.gz")
+    nibabel.save(image, tmp_path / "two_chamber.nii.gz")
+    own = '{"trigger_times_ms": [0, 200, 500, 900], "rr_ms": 1000}'
+    (tmp_path / "two_chamber_timing.json").write_text(own)
+    untimed, timed = (view.cine for view in read_nifti_views(tmp_path, rr_ms=800))
+    np.testing.assert_allclose(untimed.phases, [0, 0.25, 0.5, 0.75])
+    assert untimed.rr_s == pytest.approx(0.8)
+    np.testing.assert_allclose(timed.phases, [0, 0.2, 0.5, 0.9])
 
 
 def test_a_truncated_nifti_file_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pipeline.cli import main
     ("arguments", "words"),
     [
         (["run", "no-such-study", "--out", "o"], "no-such-study: no such study"),
-        (["run", ".", "--out", "o", "--config", "none.yaml"], "none.yaml: cannot be read"),
+        (["run", ".", "--out", "o", "--config", "none.yaml"], "none.yaml: no such file"),
         (["run", "p", "--out", "o", "--until", "polish"], "no stage 'polish'; the stages are"),
         (["run", "p", "--out", "o", "--from", "polish"], "no stage 'polish'; the stages are"),
         (["bake", "--out", "o"], "needs either a STUDY or --surfaces"),
@@ -54,8 +54,19 @@ def test_a_wrong_command_ends_with_exit_code_2(
 @pytest.mark.parametrize(
     ("yaml", "words"),
     [
-        ("bkae: {spacing_mm: 1}", "bkae: unknown key"),
-        ("bake: {spcing_mm: 1}", "bake.spcing_mm: unknown key"),
+        ("bkae: {spacing_mm: 1}", "bkae: unknown key; did you mean bake?"),
+        ("bake: {spcing_mm: 1}", "bake.spcing_mm: unknown key; did you mean spacing_mm?"),
+        ("regster: {seed: 1}", "regster: unknown key; did you mean register?"),
+        ("bake: {bounds: {sing_errors: 1}}", "did you mean sign_errors?"),
+        (
+            "fixtures: {f: {structure: aorta, kind: guidance, delta_mm: 9, f_max: 1}}",
+            "fixtures.f.f_max: unknown key; did you mean f_max_n?",
+        ),
+        (
+            "fixtures: {f: {structure: epicardum, kind: guidance, delta_mm: 9, f_max_n: 1}}",
+            "fixtures.f.structure: no structure 'epicardum'; did you mean epicardium?",
+        ),
+        ("bake: {structures: [aorta, lung]}", "bake.structures.1: no structure 'lung'"),
         ("bake: {spacing_mm: wide}", "bake.spacing_mm"),
         ("bake: [1, 2]", "bake"),
         ("fixtures: {}", "at least one fixture"),
@@ -85,6 +96,32 @@ def test_a_wrong_config_is_refused_with_file_and_key(
     said = capsys.readouterr().err
     assert "mine.yaml" in said
     assert words in said
+
+
+def test_a_configuration_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["run", str(tmp_path), "--out", str(tmp_path / "o"), "--config", "nope.yaml"]
+    assert main(arguments) == 2
+    assert "nope.yaml: no such file" in capsys.readouterr().err
+
+
+def test_surfaces_of_ones_own_have_names_of_ones_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pyvista
+
+    pyvista.Sphere(radius=20).save(tmp_path / "liver.stl")
+    config = tmp_path / "mine.yaml"
+    config.write_text(
+        "fixtures: {f: {structure: liver, kind: guidance, delta_mm: 9, f_max_n: 1}}\n"
+        "bake: {spacing_mm: 4}\n"
+    )
+    out = tmp_path / "o"
+    arguments = ["bake", "--surfaces", str(tmp_path), "--out", str(out), "--config", str(config)]
+    assert main(arguments) == 0
+    assert "no structure" not in capsys.readouterr().err
+    assert (out / "field.zarr").is_dir()
 
 
 def test_the_default_configuration_file_says_what_the_code_says() -> None:

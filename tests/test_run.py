@@ -125,6 +125,13 @@ def test_a_changed_setting_runs_only_the_stages_that_read_it(kitchen: Kitchen) -
     # b's product came out the same, so c still holds.
 
 
+@pytest.mark.parametrize("key", ["rr_ms: 800", "fill_gaps: true"])
+def test_what_study_yaml_says_of_the_cine_counts_as_input(kitchen: Kitchen, key: str) -> None:
+    kitchen.run()
+    (kitchen.folder / "study.yaml").write_text(f"cine: {{{key}}}\n")
+    assert kitchen.run()["a"] == "done"
+
+
 def test_changed_code_runs_again(kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch) -> None:
     kitchen.run()
     monkeypatch.setattr(runner, "code_digest", lambda module: "other code")

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
+import nibabel
+import numpy as np
 import pytest
+import yaml
 
 from pipeline.errors import InputError
-from pipeline.study import open_study
+from pipeline.geometry import Float
+from pipeline.study import CineFiles, EcgFiles, Study, UltrasoundFiles, open_study
+
+PAGE = Path(__file__).parent.parent / "docs" / "study.md"
+
+
+def shown(language: str) -> list[str]:
+    """The examples of one language on the page of formats."""
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
 
 
 def study_folder(root: Path, *, us: bool = True) -> Path:
@@ -66,17 +79,90 @@ def test_study_yaml_names_the_files(tmp_path: Path) -> None:
     assert study.patient_id == "Q1"
     assert study.cine.path == folder / "mr"
     assert study.cine.rr_ms == 850
+
+
+def test_study_yaml_overrides_only_the_keys_it_gives(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    found = open_study(folder)
+    (folder / "study.yaml").write_text("patient_id: robot-01\n")
+    assert open_study(folder) == found.model_copy(update={"patient_id": "robot-01"})
+    start = [[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    (folder / "study.yaml").write_text(f"us: {{initial_mr_from_tracker: {start}}}\n")
+    study = open_study(folder)
+    assert study.us is not None
+    assert found.us is not None
+    assert study.us.sweeps == found.us.sweeps
+    assert study.us.initial_mr_from_tracker == start
+    (folder / "ecg" / "mr.hea").rename(folder / "other.hea")
+    (folder / "study.yaml").write_text("ecg: {mr: other}\n")
+    assert open_study(folder).ecg.mr == folder / "other"
+    assert open_study(folder).ecg.us == folder / "ecg" / "us"
+
+
+def test_null_takes_out_what_the_folders_hold(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "study.yaml").write_text("us: null\necg: {mr: null}\n")
+    study = open_study(folder)
     assert study.us is None
+    assert study.ecg.mr is None
+
+
+@pytest.mark.parametrize("path", [None, "cine", "cine/cine.nii.gz"])
+def test_a_nifti_cine_has_its_timing_however_it_is_named(tmp_path: Path, path: str | None) -> None:
+    cine = tmp_path / "p" / "cine"
+    cine.mkdir(parents=True)
+    for name in ("cine.nii.gz", "timing.json"):
+        (cine / name).touch()
+    named = f"path: {path}, " if path else ""
+    (tmp_path / "p" / "study.yaml").write_text(f"cine: {{{named}rr_ms: 800}}\n")
+    study = open_study(tmp_path / "p")
+    assert study.cine.path == cine / "cine.nii.gz"
+    assert study.cine.timing == cine / "timing.json"
+    assert study.cine.rr_ms == 800
+
+
+def test_of_two_nifti_files_study_yaml_names_one(tmp_path: Path) -> None:
+    cine = tmp_path / "p" / "cine"
+    cine.mkdir(parents=True)
+    for name in ("a.nii.gz", "b.nii.gz"):
+        (cine / name).touch()
+    with pytest.raises(InputError, match="holds 2 NIfTI files"):
+        open_study(tmp_path / "p")
+    (tmp_path / "p" / "study.yaml").write_text("cine: {path: cine/b.nii.gz}\n")
+    assert open_study(tmp_path / "p").cine.path == cine / "b.nii.gz"
+
+
+@pytest.mark.parametrize("name", ["a.dcm", "B.IMA", "IM0001", "DICOMDIR"])
+def test_a_nifti_file_among_dicom_files_does_not_hide_them(tmp_path: Path, name: str) -> None:
+    cine = tmp_path / "p" / "cine"
+    cine.mkdir(parents=True)
+    for one in (name, "x.nii.gz", ".DS_Store", "notes.txt"):
+        (cine / one).touch()
+    with pytest.raises(InputError, match=rf"x\.nii\.gz, a NIfTI file, and {name}"):
+        open_study(tmp_path / "p")
+    (tmp_path / "p" / "study.yaml").write_text("cine: {path: cine/x.nii.gz}\n")
+    assert open_study(tmp_path / "p").cine.path == cine / "x.nii.gz"
+    (cine / name).unlink()
+    (tmp_path / "p" / "study.yaml").unlink()
+    assert open_study(tmp_path / "p").cine.path == cine / "x.nii.gz"
+
+
+def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None:
+    study_folder(tmp_path).rename(tmp_path / "patient 7")
+    with pytest.raises(InputError, match=r"patient_id: .*'patient 7'"):
+        open_study(tmp_path / "patient 7")
 
 
 @pytest.mark.parametrize(
     ("yaml", "words"),
     [
-        ("cien: {path: cine}", "cien: unknown key"),
+        ("cien: {path: cine}", r"cien: unknown key; did you mean cine\?"),
+        ("us: {sweps: [us/sweep_000.mha]}", r"us.sweps: unknown key; did you mean sweeps\?"),
+        ("qwerty: 1", "qwerty: unknown key; check its spelling"),
         ("cine: {path: nowhere}", "nowhere does not exist"),
         ("ecg: {us: ecg/lost}", "no ECG record"),
         ("us: {sweeps: [us/sweep_009.mha]}", "does not exist"),
-        ("us: {sweeps: [us/sweep_000.mha]}", "no ECG recorded with it"),
+        ("ecg: {us: null}", "no ECG recorded with it"),
         ("cine: {path: cine, rr_ms: -3}", "cine.rr_ms"),
         ("patient_id: ../../etc", "patient_id"),
         ("- a\n- b", "needs keys and values"),
@@ -113,3 +199,63 @@ def test_ultrasound_without_its_ecg(tmp_path: Path) -> None:
     (folder / "ecg" / "us.hea").unlink()
     with pytest.raises(InputError, match="no ECG recorded with it"):
         open_study(folder)
+
+
+def test_the_page_shows_every_key_of_study_yaml(tmp_path: Path) -> None:
+    (example,) = shown("yaml")
+    given = yaml.safe_load(example)
+    assert set(given) == set(Study.model_fields) - {"folder"}
+    sections = {"cine": CineFiles, "ecg": EcgFiles, "us": UltrasoundFiles}
+    for name, model in sections.items():
+        assert set(given[name]) == set(model.model_fields)
+    files = ["mr/cine.nii.gz", "mr/beat.json", "signals/scanner.csv", "signals/lab.hea"]
+    for name in [*files, "us/left.mha", "us/right.mha"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "study.yaml").write_text(example)
+    study = open_study(tmp_path)
+    assert study.cine.path == tmp_path / "mr" / "cine.nii.gz"
+    assert study.ecg.us == tmp_path / "signals" / "lab"
+
+
+def test_the_pages_timing_file_is_read(tmp_path: Path) -> None:
+    from pipeline.imaging.nifti import read_nifti_cine
+
+    timing, _ = shown("json")
+    image = nibabel.Nifti1Image(np.ones((5, 6, 3, 4), np.int16), np.diag([1, 1, 8, 1.0]))
+    nibabel.save(image, tmp_path / "cine.nii.gz")
+    (tmp_path / "timing.json").write_text(timing)
+    stack = read_nifti_cine(tmp_path / "cine.nii.gz", tmp_path / "timing.json")
+    np.testing.assert_allclose(stack.cine.phases, [0, 0.25, 0.5, 0.75])
+
+
+def test_the_pages_ecg_is_read(tmp_path: Path) -> None:
+    from pipeline.imaging.ecg import read_ecg
+
+    (table,) = shown("csv")
+    (tmp_path / "us.csv").write_text(table)
+    ecg = read_ecg(tmp_path / "us.csv")
+    assert ecg.leads == ("I", "II")
+    assert ecg.sampling_rate_hz == pytest.approx(500)
+
+
+def test_the_pages_sweep_is_read(tmp_path: Path) -> None:
+    from pipeline.imaging.ultrasound import read_sweep
+
+    (header,) = shown("mha")
+    (tmp_path / "left.mha").write_bytes(header.encode() + bytes(range(12)))
+    sweep = read_sweep(tmp_path / "left.mha")
+    assert sweep.images.tolist() == [[[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]]
+    assert sweep.times_s.tolist() == [0.447]
+    # The probe's shift after the pixel's: both matrices have no rotation.
+    first_mm: Float = sweep.tracker_from_image[0, :3, 3]
+    np.testing.assert_allclose(first_mm, (-67.2 - 77.4, 17.8 - 47.0, -140.8 + 149.1))
+
+
+def test_the_pages_phases_of_own_surfaces_are_read() -> None:
+    from pipeline.own_surfaces import Timing
+
+    _, phases = shown("json")
+    given = json.loads(phases)
+    assert set(given) == set(Timing.model_fields)
+    Timing.model_validate(given)

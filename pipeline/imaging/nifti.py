@@ -14,7 +14,7 @@ from nibabel.filebasedimages import ImageFileError
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.imaging.cine import Cine, Stack, common_phases
+from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.long_axis_series import LongAxis
 
@@ -55,8 +55,8 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
     ----------
     timing
         JSON file ``{"trigger_times_ms": [[per phase] per slice], "rr_ms": [per slice]}``; both
-        may be given once for all slices. Without it, the header's time step is taken: the
-        phases are spread evenly over one heartbeat.
+        may be given once for all slices. Without it, the phases are spread evenly over one
+        heartbeat: ``rr_ms`` if given, or else as many of the header's time steps.
     rr_ms
         Overrides the RR interval.
 
@@ -76,15 +76,7 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
             f"{path}: {slice_count} slices of {phase_count} phases; "
             f"at least {MIN_SLICES} slices of {MIN_PHASES} phases are needed"
         )
-    if timing is None:
-        triggers, own_rr_ms = _header_timing(image, path, phase_count, slice_count)
-        source = "NIfTI time step"
-    else:
-        triggers, own_rr_ms = _timing_file(timing, phase_count, slice_count)
-        source = timing.name
-    if rr_ms is not None:
-        own_rr_ms = np.full(slice_count, rr_ms)
-        source = "study.yaml"
+    triggers, own_rr_ms, source = _timing(image, path, timing, rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(timing or path))
     cine = Cine(
         np.ascontiguousarray(intensity, np.float32),
@@ -95,8 +87,14 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
     return Stack(cine, triggers, own_rr_ms, source, ())
 
 
-def read_nifti_views(folder: Path) -> tuple[LongAxis, ...]:
+def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis, ...]:
     """Long-axis views ``<name>.nii.gz`` of a folder, each with ``<name>_timing.json`` beside it.
+
+    Parameters
+    ----------
+    rr_ms
+        RR interval of views that have no such file, over which their phases are spread evenly;
+        without it, their header's time step tells.
 
     Raises
     ------
@@ -104,10 +102,10 @@ def read_nifti_views(folder: Path) -> tuple[LongAxis, ...]:
         When a file is not a readable 4D image of one slice, or has no usable timing.
     """
     paths = [*folder.glob("*.nii"), *folder.glob("*.nii.gz")] if folder.is_dir() else []
-    return tuple(_read_view(path) for path in sorted(paths))
+    return tuple(_read_view(path, rr_ms) for path in sorted(paths))
 
 
-def _read_view(path: Path) -> LongAxis:
+def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
     name = path.name.removesuffix(".gz").removesuffix(".nii")
     image = _load(path)
     if len(image.shape) != 4 or image.shape[2] != 1 or image.shape[3] < MIN_PHASES:
@@ -118,13 +116,11 @@ def _read_view(path: Path) -> LongAxis:
         )
     intensity, mr_from_index = read_image(path)
     timing = path.with_name(f"{name}_timing.json")
-    if timing.exists():
-        triggers, rr_ms = _timing_file(timing, len(intensity), 1)
-    else:
-        triggers, rr_ms = _header_timing(image, path, len(intensity), 1)
-    phases = common_phases(triggers, rr_ms, str(timing if timing.exists() else path))
+    own = timing if timing.exists() else None
+    triggers, own_rr_ms, _ = _timing(image, path, own, None if own else rr_ms)
+    phases = common_phases(triggers, own_rr_ms, str(own or path))
     pixels = np.ascontiguousarray(intensity, np.float32)
-    return LongAxis(name, Cine(pixels, mr_from_index, phases, float(rr_ms[0]) / 1000))
+    return LongAxis(name, Cine(pixels, mr_from_index, phases, float(own_rr_ms[0]) / 1000))
 
 
 def _load(path: Path) -> Any:
@@ -151,15 +147,42 @@ def _right_angled_affine(image: Any, path: Path) -> Float:
     return affine
 
 
-def _header_timing(image: Any, path: Path, phases: int, slices: int) -> tuple[Float, Float]:
+def _timing(
+    image: Any, path: Path, timing: Path | None, rr_ms: float | None
+) -> tuple[Float, Float, str]:
+    """Trigger times ``(slice, phase)`` and RR intervals ``(slice,)``, ms, and who tells them."""
+    slices, phases = image.shape[2:]
+    if timing is not None:
+        triggers, own_rr_ms = _timing_file(timing, phases, slices)
+        if rr_ms is None:
+            return triggers, own_rr_ms, timing.name
+        return triggers, np.full(slices, rr_ms), "study.yaml"
+    source = "study.yaml"
+    if rr_ms is None:
+        rr_ms, source = _header_rr_ms(image, path, phases), "NIfTI time step"
+    triggers = np.tile(rr_ms / phases * np.arange(phases), (slices, 1))
+    return triggers, np.full(slices, rr_ms), source
+
+
+def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
+    """One heartbeat of evenly spread phases, as the header's time step tells it."""
     unit = image.header.get_xyzt_units()[1]
     step_ms = 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
     if not step_ms > 0:
         raise InputError(
             f"{path}: has no trigger times: no timing file beside it and no time step in its "
-            'header; write timing.json with "trigger_times_ms" and "rr_ms" beside it'
+            'header; write timing.json with "trigger_times_ms" and "rr_ms" beside it, or, for '
+            "phases evenly spread over the beat, give cine.rr_ms in study.yaml"
         )
-    return np.tile(step_ms * np.arange(phases), (slices, 1)), np.full(slices, step_ms * phases)
+    low_ms, high_ms = (1000 * limit for limit in PLAUSIBLE_RR_S)
+    if not low_ms < step_ms * phases < high_ms:
+        raise InputError(
+            f"{path}: RR interval {step_ms * phases:g} ms = {phases} phases x the header's time "
+            f"step of {step_ms:g} ms, a heartbeat lasts {low_ms:g} to {high_ms:g} ms; write a "
+            "timing file beside it, or, for phases evenly spread over the beat, give cine.rr_ms "
+            "in study.yaml"
+        )
+    return step_ms * phases
 
 
 def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:

@@ -24,7 +24,7 @@ def run(job: Job) -> dict[str, Any]:
         stack, views = read_dicom_study(files.path, files.rr_ms, files.fill_gaps)
     else:
         stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
-        views = read_nifti_views(job.study.long_axis)
+        views = read_nifti_views(job.study.long_axis, files.rr_ms)
     _require_ecg_as_long(job, stack)
     write_cine(job.folder, stack, views)
     cine = stack.cine
