@@ -302,7 +302,11 @@ def test_pictures_repeat_to_the_byte() -> None:
     ("name", "value", "row"),
     [
         ("drift_max_mm", 0.092345, ("drift max", "0.0923 mm")),
-        ("force_step_max_n_per_0_1_mm", 0.4144, ("force step max", "0.414 N over 0.1 mm")),
+        (
+            "force_step_max_n_per_0_1_mm",
+            0.4144,
+            ("force step max per 0.1 mm", "0.414 N over 0.1 mm"),
+        ),
         ("stiffness_n_per_m", 385.718, ("stiffness", "386 N/m")),
         ("node_error_far_mm", 6.37693e-06, ("node error far", "6.38e-06 mm")),
         ("sign_errors", 0, ("sign errors", "0")),

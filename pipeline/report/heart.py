@@ -72,7 +72,10 @@ def movement(
     shown: list[Picture] = []
     animation = beating_surfaces(surfaces, rr_s)
     if animation is not None:
-        caption = f"One heartbeat, seen from the front left ({len(phases)} phases)"
+        caption = (
+            "One heartbeat, seen from the front left: muscle red, right ventricle green, atria "
+            "yellow (left) and pink, aorta orange"
+        )
         shown.append(picture(caption, animation, "webp"))
     volumes = as_svg(curves.volume_curves(phases, measures["volumes_ml"]))
     shown.append(picture("Volumes through the cycle", volumes, "svg"))

@@ -16,7 +16,7 @@ from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, Float32, MovingSurface, Surface, transform_points
 from pipeline.imaging.labels import LABELS
 from pipeline.report.moments import Moments
-from pipeline.report.style import SURFACE_STYLES, show_grey, words
+from pipeline.report.style import SURFACE_STYLES, handle, show_grey, words
 
 
 def fixture_profiles(fixtures: Mapping[str, Fixture]) -> Figure:
@@ -47,7 +47,7 @@ def potential_on_slice(shown: Moments, field: ForceField, fixture: str) -> Figur
         show_grey(axis, shown.intensity[moment, number][window], shown.pixel_aspect)
         phase = float(shown.phases[moment])
         image = _draw_field(axis, field, fixture, points_mm, phase, shown.pixel_aspect)
-        axis.set_title(f"{name}: {words(fixture)}", fontsize=9)
+        axis.set_title(f"{name}, slice {number}: {words(fixture)}", fontsize=11)
     assert image is not None
     figure.colorbar(image, ax=list(axes), label="potential", shrink=0.8)
     return figure
@@ -70,7 +70,7 @@ def cuts_on_ultrasound(
     phases
         ``(frame,)``.
     """
-    figure = Figure(figsize=(3.2 * len(images), 3.4), layout="constrained")
+    figure = Figure(figsize=(3.2 * len(images), 2.9), layout="constrained")
     axes = figure.subplots(1, len(images), squeeze=False)[0]
     for axis, image, transform, phase in zip(axes, images, image_from_mr, phases, strict=True):
         show_grey(axis, image)
@@ -86,6 +86,13 @@ def cuts_on_ultrasound(
         rows, columns = image.shape
         axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
         axis.set_title(f"phase {phase:.2f}", fontsize=9)
+    drawn = {name: style for name, style in SURFACE_STYLES.items() if name in surfaces}
+    figure.legend(
+        handles=[handle(name, *style) for name, style in drawn.items()],
+        loc="outside lower center",
+        ncols=len(drawn),
+        fontsize=9,
+    )
     return figure
 
 
@@ -115,10 +122,11 @@ def _draw_field(
     value = field.potential(flat, phase, fixture=fixture).reshape(shape)
     structure = field.fixtures[fixture].structure
     distance_mm = field.distance_mm(flat, phase, structure=structure).reshape(shape)
-    # Where nothing is felt the MR shows through.
-    image = axis.imshow(value, cmap="plasma", alpha=0.5 * value, vmin=0, vmax=1, aspect=aspect)
+    # The MR shows through where nothing is felt, and where all is: the colour says where it rises.
+    alpha = 0.15 + 0.45 * 4 * value * (1 - value)
+    image = axis.imshow(value, cmap="plasma", alpha=alpha, vmin=0, vmax=1, aspect=aspect)
     lines = axis.contour(distance_mm, levels=np.arange(-20, 21, 5), colors="w", linewidths=0.7)
-    axis.clabel(lines, fmt="%d mm", fontsize=6)
+    axis.clabel(lines, fmt="%d mm", fontsize=9)
     axis.contour(distance_mm, levels=[0], colors="w", linewidths=2)
     step = 7
     force_n = field.force_n(flat, phase, fixture=fixture).reshape(*shape, 3)[::step, ::step]
@@ -129,7 +137,9 @@ def _draw_field(
         ]
     )
     rows, columns = np.mgrid[0 : shape[0] : step, 0 : shape[1] : step]
-    axis.quiver(columns, rows, *in_plane, color="#56B4E9", angles="xy", width=0.004)
+    arrows = axis.quiver(columns, rows, *in_plane, color="#56B4E9", angles="xy", width=0.004)
+    most_n = field.fixtures[fixture].f_max_n
+    axis.quiverkey(arrows, 0.82, 0.04, most_n, f"{most_n:g} N", labelpos="E", labelcolor="w")
     return image
 
 
