@@ -239,7 +239,8 @@ class ForceField:
         """
         kernel = self._distance_at or self._load()[0]
         try:
-            addresses = self._addresses[structure or self._fixtures[self._first].structure]
+            name = self._fixtures[self._first].structure if structure is None else structure
+            addresses = self._addresses[name]
         except KeyError:
             raise self._unknown("structure", structure, self._addresses) from None
         where = four_floats(x_mm, y_mm, z_mm, phase)
