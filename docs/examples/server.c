@@ -1,0 +1,92 @@
+/* A force server: R peaks in, the heart's phase now, the force on a tool out.
+ *
+ *     beatfield rpeaks STUDY/ecg/us --out peaks.csv
+ *     cc -O2 -I "$(python -c 'from pipeline.field import get_include; print(get_include())')" \
+ *        docs/examples/server.c -o server -lm
+ *     ./server OUT/patient-0001/bake/field.zarr peaks.csv X Y Z > forces.csv
+ *
+ * plays the peaks when they became known and holds the tool's tip at one point of the MR, in LPS
+ * millimetres. A real server does the same with the peaks of its monitor, its own time, and a tip
+ * that field.mr_from_tracker takes from the tracker's frame to that of the MR.
+ */
+#define BEATFIELD_IMPLEMENTATION
+#define BEATFIELD_CLOCK_IMPLEMENTATION
+#include "beatfield.h"
+#include "beatfield_clock.h"
+
+#define RATE_HZ 1000
+#define USUAL_RR_S 0.8          /* of a field that does not know the length of its heartbeat */
+#define FORCE_RATE_N_PER_S 10.0 /* how fast forces are faded in and out */
+
+typedef struct {
+    double r_s, known_s;
+    int strange;
+} peak;
+
+/* The next row of `beatfield rpeaks`; 0 at the end of the file. */
+static int next_peak(FILE *file, peak *found)
+{
+    char line[256], kind[16];
+    if (!fgets(line, sizeof line, file)) return 0;
+    const char *last = strrchr(line, ',');
+    if (!last || sscanf(line, "%lf,%15[^,]", &found->r_s, kind) != 2) return 0;
+    found->known_s = atof(last + 1);
+    found->strange = !strcmp(kind, "ectopic");
+    return 1;
+}
+
+/* A row a millisecond, until the last peak. */
+static bf_status serve(const bf_field *field, FILE *peaks, const double tip_mm[3])
+{
+    const double fade_per_s = FORCE_RATE_N_PER_S / field->fixture[0].f_max_n;
+    bf_clock clock = bf_new_clock(field->rr_s > 0 ? field->rr_s : USUAL_RR_S, fade_per_s);
+    bf_status status = BF_OK;
+    bf_tick now;
+    peak next;
+    double force_n[3];
+    int more = next_peak(peaks, &next), lead_connected = 1;
+    for (long turn = 0; more && status == BF_OK; turn++) {
+        double time_s = (double)turn / RATE_HZ;
+        /* Times in the file are rounded to 10 us. */
+        while (more && next.known_s <= time_s + 1e-5) {
+            bf_beat(&clock, next.r_s, next.strange);
+            more = next_peak(peaks, &next);
+        }
+        bf_now(&clock, time_s, lead_connected, &now);
+        status = bf_force(field, 0, tip_mm, now.phase, force_n);
+        /* Fading is all that a lost lead, an early beat or fibrillation asks of a server. */
+        printf("%.3f,%.6f,%d,%.6f,%.6f,%.6f,%.6f\n", time_s, now.phase, now.valid, now.fade,
+               now.fade * force_n[0], now.fade * force_n[1], now.fade * force_n[2]);
+    }
+    return status;
+}
+
+int main(int count, char **words)
+{
+    bf_field field;
+    bf_status status;
+    FILE *peaks;
+    char header[256];
+    double tip_mm[3];
+    int n;
+    if (count != 6) {
+        fprintf(stderr, "use: %s FIELD PEAKS X Y Z (LPS mm)\n", words[0]);
+        return 2;
+    }
+    for (n = 0; n < 3; n++) tip_mm[n] = atof(words[3 + n]);
+    peaks = fopen(words[2], "r");
+    if (!peaks || !fgets(header, sizeof header, peaks)) {
+        fprintf(stderr, "error: %s: cannot be read\n", words[2]);
+        return 2;
+    }
+    status = bf_open(&field, words[1]);
+    if (status == BF_OK) {
+        bf_lock(&field); /* pages in memory before the loop starts; where not allowed, read at least */
+        printf("time_s,phase,valid,fade,x_n,y_n,z_n\n");
+        status = serve(&field, peaks, tip_mm);
+        bf_close(&field);
+    }
+    fclose(peaks);
+    if (status != BF_OK) fprintf(stderr, "error: %s: %s\n", words[1], bf_text(status));
+    return status == BF_OK ? 0 : 2;
+}

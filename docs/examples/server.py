@@ -1,0 +1,67 @@
+"""A force server: samples of an ECG in, the heart's phase now, the force on a tool out.
+
+    python docs/examples/server.py FIELD ECG X Y Z > forces.csv
+
+plays a recording (WFDB, CSV or DICOM) as a monitor would send it and holds the tool's tip at one
+point of the MR, in LPS millimetres. A real server does the same with its own samples, time and tip,
+which `field.mr_from_tracker` takes from the tracker's frame to that of the MR.
+"""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.errors import InputError
+from pipeline.field import ForceField
+from pipeline.imaging.ecg import Ecg, read_ecg
+from pipeline.registration.clock import PhaseClock
+from pipeline.registration.rpeaks import RPeakDetector
+
+RATE_HZ = 1000
+USUAL_RR_S = 0.8
+"""Of a field that does not know the length of its heartbeat."""
+
+Row = tuple[float, float, bool, float, float, float, float]
+
+
+def serve(field: ForceField, ecg: Ecg, tip_mm: tuple[float, float, float]) -> Iterator[Row]:
+    """Time (s), phase, whether it is valid, share of the force that is rendered, force (N)."""
+    fixture, law = next(iter(field.fixtures.items()))
+    clock = PhaseClock(field.rr_s or USUAL_RR_S, f_max_n=law.f_max_n)
+    detector = RPeakDetector(ecg.sampling_rate_hz, ecg.signal_mv.shape[1])
+    seen = 0
+    for turn in range(int(len(ecg.signal_mv) / ecg.sampling_rate_hz * RATE_HZ)):
+        now_s = turn / RATE_HZ
+        arrived = 1 + int(now_s * ecg.sampling_rate_hz + 1e-6)
+        for beat in detector.push(ecg.signal_mv[seen:arrived]):
+            clock.beat(beat.time_s, beat.strange)
+        seen = arrived
+        tick = clock.at(now_s, detector.usable)
+        force_n = field.force_at(*tip_mm, tick.phase, fixture)
+        # Fading is all that a lost lead, an early beat or fibrillation asks of a server.
+        x_n, y_n, z_n = (tick.fade * part for part in force_n)
+        yield now_s, tick.phase, tick.valid, tick.fade, x_n, y_n, z_n
+
+
+def main(words: list[str]) -> int:
+    """Print a row a millisecond as CSV."""
+    try:
+        path, record, *numbers = words
+        x_mm, y_mm, z_mm = map(float, numbers)
+    except ValueError:
+        sys.stderr.write("use: server.py FIELD ECG X Y Z (LPS mm)\n")
+        return 2
+    try:
+        rows = serve(ForceField.open(path), read_ecg(Path(record)), (x_mm, y_mm, z_mm))
+        sys.stdout.write("time_s,phase,valid,fade,x_n,y_n,z_n\n")
+        for time_s, phase, valid, fade, *force_n in rows:
+            forces = ",".join(f"{part:.6f}" for part in force_n)
+            sys.stdout.write(f"{time_s:.3f},{phase:.6f},{valid:d},{fade:.6f},{forces}\n")
+    except InputError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
