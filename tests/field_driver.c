@@ -20,6 +20,17 @@ static int ask(const bf_field *field)
     return 0;
 }
 
+/* FIELD contains: points -> 1 or 0 */
+static int contains(const bf_field *field)
+{
+    double q[3], answer;
+    while (fread(q, sizeof(double), 3, stdin) == 3) {
+        answer = bf_contains(field, q);
+        fwrite(&answer, sizeof(double), 1, stdout);
+    }
+    return 0;
+}
+
 /* FIELD tool BOUND COUNT CLOSED: the tool's points first, then a transform and a phase each ->
  * force, torque and evaluations */
 static int feel(const bf_field *field, double bound_n, int count, int closed)
@@ -100,6 +111,7 @@ int main(int count, char **words)
     else if (count > 4) failed = tank(atof(words[3]), atof(words[4]));
     else if (count > 2 && strcmp(words[2], "refuse") == 0) failed = refuse(&field);
     else if (count > 2 && strcmp(words[2], "lock") == 0) failed = bf_lock(&field) == BF_CANNOT_READ;
+    else if (count > 2 && strcmp(words[2], "contains") == 0) failed = contains(&field);
     else failed = ask(&field);
     bf_close(&field);
     bf_close(&field);

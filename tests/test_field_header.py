@@ -96,6 +96,26 @@ def test_a_million_answers_are_pythons(path, program):
         assert (np.abs(found - expected) <= 1e-12 * scale).all()
 
 
+def test_what_lies_in_the_grid_is_pythons(path, program):
+    field = ForceField.open(path)
+    low, high = np.array(field.grid.origin_mm), field.grid.upper_mm
+    rng = np.random.default_rng(1)
+    around = rng.uniform(low - 10, high + 10, (10_000, 3))
+    middle = (low + high) / 2
+    edges = [
+        np.where(np.arange(3) == axis, end, middle) for axis in range(3) for end in (low, high)
+    ]
+    beyond = [middle + (edge - middle) * (1 + 1e-9) for edge in edges]
+    points = np.array([*around, *edges, *beyond])
+    done = run(program, path, "contains", given=points.tobytes())
+    found = np.frombuffer(done.stdout) == 1
+    np.testing.assert_array_equal(found, field.contains(points))
+    np.testing.assert_array_equal(found[-12:], [True] * 6 + [False] * 6)
+    assert 0.1 < found[:10_000].mean() < 0.9
+    nowhere = np.array([np.nan, *middle[1:]])
+    assert np.frombuffer(run(program, path, "contains", given=nowhere.tobytes()).stdout) == 0
+
+
 def test_example_prints_what_query_says(path, tmp_path):
     program = build(EXAMPLE, tmp_path / "query")
     field = ForceField.open(path)

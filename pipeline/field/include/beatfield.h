@@ -105,6 +105,10 @@ void bf_close(bf_field *field);
 int bf_structure(const bf_field *field, const char *name);
 int bf_fixture(const bf_field *field, const char *name);
 
+/* Whether a point lies in the grid. What lies outside is answered for the nearest point of the grid's
+ * boundary, and says less the farther out it is. */
+int bf_contains(const bf_field *field, const double point_mm[3]);
+
 /* Signed distance in mm and its gradient; either may be NULL. */
 bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
                       double *distance_mm, double gradient[3]);
@@ -1524,6 +1528,17 @@ bf_status bf_forces(const bf_field *field, int fixture, size_t count, const doub
     batch.rest = NULL;
     batch.slabs = 1;
     return bf__answer_all(&batch, scratch);
+}
+
+int bf_contains(const bf_field *field, const double point_mm[3])
+{
+    int axis, inside = 1;
+    for (axis = 0; axis < 3; axis++) {
+        double low_mm = field->origin_mm[axis];
+        double high_mm = low_mm + (field->shape[axis] - 1) * field->spacing_mm[axis];
+        inside &= point_mm[axis] >= low_mm && point_mm[axis] <= high_mm;
+    }
+    return inside;
 }
 
 void bf_transform(const double t[16], const double point_mm[3], double moved_mm[3])
