@@ -2,7 +2,7 @@
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--peer 20]
-        [--global 0]
+        [--global 0] [--calibration-error MM DEG]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
@@ -10,8 +10,9 @@ lost and level of noise, and registered from starts of up to 20 mm and 20 degree
 benchmarks/segmentation_figures.py leaves them: its hearts are registered to what the pipeline found
 in the cine, and to the cine itself, rather than to the phantom's own meshes. ``--peer N`` runs
 SimpleITK's mutual information beside it on the first N studies, ``--global N`` registers the first
-N without any start. Results are kept line by line in OUT/results.jsonl; what is there is not done
-again.
+N without any start. ``--calibration-error MM DEG`` puts the pictures of each sweep so far beside
+their place, and registers with ``calibration: per_sweep`` too (0 0: nothing is wrong). Results are
+kept line by line in OUT/results.jsonl; what is there is not done again.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from registration_studies import (
     Study,
     found_surfaces,
     make_study,
+    miscalibrated,
     start_of,
     true_surfaces,
 )
@@ -80,12 +82,15 @@ def error_mm(study: Study, pose: Float) -> Float:
 
 
 def registered(
-    study: Study, surfaces: dict[str, MovingSurface], cine: Cine | None, start: Float | None
+    study: Study,
+    surfaces: dict[str, MovingSurface],
+    cine: Cine | None,
+    start: Float | None,
+    settings: RegisterSettings,
 ) -> dict[str, Any]:
     """One registration: errors, verdict and seconds."""
     began = time.perf_counter(), time.process_time()
     try:
-        settings = RegisterSettings()
         found = find(study.sweeps, study.phases, surfaces, start, settings, cine=cine)
     except BeatfieldError as refusal:
         return {"verdict": "refused", "reason": str(refusal)}
@@ -142,7 +147,7 @@ def work(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         for number, order in enumerate(orders(arguments)):
             for method, start in tasks(arguments, number):
                 if (order.name, method, start) not in done:
-                    one = result_of(order, method, start, arguments.out, products)
+                    one = result_of(order, method, start, arguments, products)
                     results.append(one)
                     handle.write(json.dumps(one) + "\n")
                     handle.flush()
@@ -154,22 +159,28 @@ def tasks(arguments: argparse.Namespace, number: int) -> list[tuple[str, int]]:
     # Starts are numbered through all studies, so that how far off they are goes round.
     first = number * arguments.starts
     ours = [("beatfield", start) for start in range(first, first + arguments.starts)]
+    wrong = arguments.calibration_error is not None
+    ours += [("per_sweep", start) for start in range(first, first + arguments.starts) if wrong]
     ours += [("global", first)] if number < arguments.without_start else []
     return ours + ([("peer", first)] if number < arguments.peer else [])
 
 
 def result_of(
-    order: Order, method: str, start: int, folder: Path, products: Path | None
+    order: Order, method: str, start: int, arguments: argparse.Namespace, products: Path | None
 ) -> dict[str, Any]:
     """One line of the results."""
-    study = make_study(order, folder / "studies")
+    study = make_study(order, arguments.out / "studies")
+    if arguments.calibration_error is not None:
+        study = miscalibrated(study, order.seed, *arguments.calibration_error)
     share = SHARES[start % len(SHARES)]
     guess = start_of(study, 100 * order.seed + start, 20 * share, 20 * share)
     if method == "peer":
         measured = peer(order, study, guess)
     else:
         surfaces, cine = _model(order, products)
-        measured = registered(study, surfaces, cine, None if method == "global" else guess)
+        known = None if method == "global" else guess
+        settings = RegisterSettings(calibration="per_sweep" if method == "per_sweep" else "fixed")
+        measured = registered(study, surfaces, cine, known, settings)
     about = {"study": order.name, "method": method, "start": start, "share": share}
     keys = ("probe", "frames", "dropout", "snr_db", "pathology")
     return about | {key: getattr(order, key) for key in keys} | measured
@@ -209,7 +220,12 @@ def tables(results: list[dict[str, Any]]) -> str:
     """All results as Markdown."""
     ours = [one for one in results if one["method"] == "beatfield"]
     text = [HEAD]
-    names = {"beatfield": "beatfield", "global": "without a start", "peer": "SimpleITK MI"}
+    names = {
+        "beatfield": "beatfield",
+        "per_sweep": "calibration: per_sweep",
+        "global": "without a start",
+        "peer": "SimpleITK MI",
+    }
     for method, name in names.items():
         some = [one for one in results if one["method"] == method]
         text += [line(name, some)] if some else []
@@ -223,7 +239,14 @@ def tables(results: list[dict[str, Any]]) -> str:
         text += ["", f"By {key}:", "", HEAD]
         for value in sorted({str(one[key]) for one in ours}):
             text.append(line(value, [one for one in ours if str(one[key]) == value]))
-    return "\n".join([*text, "", *calibration(ours)])
+    text += ["", *calibration(ours)]
+    corrected = [one for one in results if one["method"] == "per_sweep"]
+    if corrected:
+        text += ["", "With calibration: per_sweep:", "", HEAD]
+        for probe in sorted({one["probe"] for one in corrected}):
+            text.append(line(probe, [one for one in corrected if one["probe"] == probe]))
+        text += ["", *calibration(corrected)]
+    return "\n".join(text)
 
 
 def calibration(results: list[dict[str, Any]]) -> list[str]:
@@ -300,6 +323,7 @@ def main() -> None:
     parser.add_argument("--probes", default="combined,intracardiac,epicardial")
     parser.add_argument("--surfaces", default="truth")
     parser.add_argument("--peer", type=int, default=20)
+    parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
     parser.add_argument("--global", dest="without_start", type=int, default=0)
     print(tables(work(parser.parse_args())))
 

@@ -8,11 +8,12 @@ drowned in noise afterwards.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_synth.echo import Optics, silence
 from data_synth.probe import EXAMINATIONS
@@ -22,6 +23,7 @@ from data_synth.simulate import stream as stream_of
 from data_synth.ultrasound import fitted_probe, simulate_sweeps
 from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.products import read_surfaces, read_table
+from pipeline.registration.correction import tracker_from_picture
 
 PATHOLOGIES = (
     "healthy",
@@ -196,10 +198,25 @@ def found_surfaces(products: Path) -> dict[str, MovingSurface]:
     return read_surfaces(products / "surface", phases)
 
 
+def miscalibrated(study: Study, seed: int, shift_mm: float, turn_deg: float) -> Study:
+    """The study as each sweep's own wrong calibration shows it: its pictures are so far beside
+    their place, about the middle of the sector and in a random direction, wherever the probe is."""
+    rng = np.random.default_rng([seed, 11])
+    sweeps = []
+    for sweep in study.sweeps:
+        way, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+        off = np.eye(4)
+        off[:3, :3] = Rotation.from_rotvec(np.radians(turn_deg) * axis).as_matrix()
+        off[:3, 3] = shift_mm * way
+        middle = np.argwhere(sweep.images.max(axis=0) > 0).mean(axis=0)[::-1].round()
+        planes = tracker_from_picture(sweep.tracker_from_image, middle.astype(np.int64))
+        beside = planes @ off @ np.linalg.inv(planes)
+        sweeps.append(replace(sweep, tracker_from_image=beside @ sweep.tracker_from_image))
+    return replace(study, sweeps=sweeps)
+
+
 def start_of(study: Study, seed: int, shift_mm: float, turn_deg: float) -> Float:
     """A first guess this far off: turned about the heart's middle, and shifted."""
-    from scipy.spatial.transform import Rotation
-
     rng = np.random.default_rng([seed, 7])
     axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     middle = study.targets_mm.mean(axis=0)

@@ -52,6 +52,14 @@ class RegisterSettings(BaseModel):
     """Whether each sweep was recorded in a breath-hold, or in free breathing: then every frame's
     own displacement along the breathing axis is found, and the pose is that of the heart at the
     end of expiration."""
+    calibration: Literal["fixed", "per_sweep"] = "fixed"
+    """Whether each sweep's image calibration is right, or a small rigid correction of it is found
+    together with the pose."""
+    calibration_sd_mm: float = Field(2.0, gt=0, le=20)
+    """Standard deviation, along each axis, of how far a calibration may be off in the middle of
+    the picture, with ``calibration: per_sweep``."""
+    calibration_sd_deg: float = Field(2.0, gt=0, le=20)
+    """The same for rotation, about each axis."""
     accept: Literal["good", "doubtful"] = "doubtful"
     """The worst verdict that is let pass."""
     clock_offset: Literal["apply", "measure", "ignore"] = "apply"

@@ -17,7 +17,9 @@ from pipeline.errors import InputError, StageError
 from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
 from pipeline.registration.breathing import follow_breath
+from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
+from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Level, Search, prepare_search
@@ -84,6 +86,9 @@ class Registration:
     """``(frames,)`` how far the heart has moved with breathing, along
     `pipeline.registration.breathing.AXIS`; 0 where breath was held, or the frame is not used."""
 
+    corrections: tuple[Correction, ...]
+    """Of each sweep's image calibration; none where calibrations were not looked at."""
+
     verdict: Grade
     """``good``, ``doubtful`` or ``failed``."""
 
@@ -108,6 +113,7 @@ class _Found:
     rival: float
     clock: ClockOffset | None
     everything: Level
+    calibration: Calibration | None
     breath_mm: Float
     bears_out: Mask
     """Of the frames of ``everything``, as those of ``breath_mm``."""
@@ -191,12 +197,14 @@ def find(
     everything = search.fine_level(sweeps)
     sizes = [len(sweep.images) for sweep in sweeps]
     pose = _refined(everything, best.pose, search)
+    everything, pose, calibration = _calibrated(everything, pose, search, sweeps)
     everything, pose, breath_mm = _breathing(everything, pose, search, sizes)
     tell(4, _STEPS)
     tiny = np.finfo(float).tiny
     confidence, rival = best.score / max(chance, tiny), best.rival / max(best.score, tiny)
     bears_out = _bears_out(everything, pose, search.pivot)
-    found = _Found(pose, confidence, rival, settled.clock, everything, breath_mm, bears_out)
+    sure = confidence, rival, settled.clock
+    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out)
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -265,6 +273,21 @@ def _some(points_mm: Float) -> Float:
     return points_mm[:: max(1, len(points_mm) // _POINTS)]
 
 
+def _calibrated(
+    level: Level, pose: Float, search: Search, sweeps: Sequence[TrackedSweep]
+) -> tuple[Level, Float, Calibration | None]:
+    """Frames and pose with each sweep's calibration put right, if that may be wrong."""
+    if search.settings.calibration == "fixed":
+        return level, pose, None
+
+    def bears_out(placed: Level, pose: Float) -> Mask:
+        return _bears_out(placed, pose, search.pivot)
+
+    given = calibration_of(sweeps, level, search.pivot, search.settings)
+    found, pose = calibrate(given, level, pose, search.settings, bears_out)
+    return found.placed(level), pose, found
+
+
 def _breathing(
     level: Level, pose: Float, search: Search, sizes: Sequence[int]
 ) -> tuple[Level, Float, Float]:
@@ -281,8 +304,11 @@ def _sweep_of(level: Level, sizes: Sequence[int]) -> Integer:
     return np.searchsorted(np.cumsum(sizes), level.samples.number, side="right")
 
 
-def _covariance(found: _Found, search: Search, sizes: Sequence[int]) -> Float:
-    """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor."""
+def _covariance(
+    found: _Found, search: Search, sizes: Sequence[int]
+) -> tuple[Float, tuple[Correction, ...]]:
+    """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor
+    and what corrections of calibrations leave open; and these corrections."""
     judged = found.everything
     if found.bears_out.sum() >= search.settings.min_frames:
         judged = judged.only(np.flatnonzero(found.bears_out))
@@ -290,7 +316,10 @@ def _covariance(found: _Found, search: Search, sizes: Sequence[int]) -> Float:
     curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
     spread = in_radians(sandwich(curvature, _sweep_of(judged, sizes)), search.pivot)
     floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
-    return np.asarray(spread + floor)
+    if found.calibration is None:
+        return np.asarray(spread + floor), ()
+    opened, corrections = certainty(found.calibration, judged, found.pose, search.settings)
+    return np.asarray(spread + floor + opened), corrections
 
 
 def _summarise(
@@ -299,7 +328,7 @@ def _summarise(
     """Judge every frame of the study, and the pose itself."""
     level, pose, pivot = found.everything, found.pose, search.pivot
     frames = sum(sizes)
-    covariance = _covariance(found, search, sizes)
+    covariance, corrections = _covariance(found, search, sizes)
     expected = expected_tre_mm(covariance, pivot.centre_mm, heart_mm)
     verdict = _verdict(found, search, frames, float(np.sqrt((expected**2).mean())))
     judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
@@ -321,6 +350,7 @@ def _summarise(
         centre_mm=pivot.centre_mm,
         expected_mm=float(np.sqrt((expected**2).mean())),
         breath_mm=breath_mm,
+        corrections=corrections,
         verdict=verdict.grade,
         reason=verdict.reason,
         clock=found.clock,

@@ -45,18 +45,36 @@ class Curvature:
 
 def curvature_at(losses: FrameLosses) -> Curvature:
     """Derivatives by central differences at step zero."""
+    slopes, bending = frame_curvatures(losses)
+    return Curvature(slopes, bending.sum(axis=0))
+
+
+def slopes_at(losses: FrameLosses) -> Float:
+    """``(frames, 6)`` slopes of each frame's loss by central differences at step zero."""
+    ahead, behind = _either_side(losses)
+    return (ahead - behind) / (2 * _STEP_MM)
+
+
+def frame_curvatures(losses: FrameLosses) -> tuple[Float, Float]:
+    """``(frames, 6)`` slopes and ``(frames, 6, 6)`` bending of each frame's loss, alike."""
+    ahead, behind = _either_side(losses)
+    here = losses(np.zeros(6))
+    bending = np.zeros((len(here), 6, 6))
     steps = _STEP_MM * np.eye(6)
-    ahead = np.array([losses(step) for step in steps])
-    behind = np.array([losses(-step) for step in steps])
-    slopes = (ahead - behind).T / (2 * _STEP_MM)
-    here = losses(np.zeros(6)).sum()
-    bending = np.diag((ahead + behind).sum(axis=1) - 2 * here)
     for i in range(6):
+        bending[:, i, i] = ahead[:, i] + behind[:, i] - 2 * here
         for j in range(i):
             same = losses(steps[i] + steps[j]) + losses(-steps[i] - steps[j])
             cross = losses(steps[i] - steps[j]) + losses(steps[j] - steps[i])
-            bending[i, j] = bending[j, i] = (same - cross).sum() / 4
-    return Curvature(slopes, bending / _STEP_MM**2)
+            bending[:, i, j] = bending[:, j, i] = (same - cross) / 4
+    return (ahead - behind) / (2 * _STEP_MM), bending / _STEP_MM**2
+
+
+def _either_side(losses: FrameLosses) -> tuple[Float, Float]:
+    """``(frames, 6)`` losses a step ahead along each direction, and behind."""
+    steps = _STEP_MM * np.eye(6)
+    ahead = np.stack([losses(step) for step in steps], axis=1)
+    return ahead, np.stack([losses(-step) for step in steps], axis=1)
 
 
 def sandwich(curvature: Curvature, sweep: Integer, reach: float = 0.25) -> Float:

@@ -47,6 +47,7 @@ def run(job: Job) -> dict[str, Any]:
         "reason": found.reason,
         "expected_tre_mm": round(found.expected_mm, 3),
         "breath_range_mm": round(float(np.ptp(found.breath_mm)), 2),
+        "calibration": "; ".join(one.words() for one in found.corrections),
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
         **_clock_figures(found),
     }
@@ -125,6 +126,7 @@ def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
             "expected_tre_mm": round(found.expected_mm, 3),
             "verdict": found.verdict,
             "reason": found.reason,
+            "calibration": [one.table() for one in found.corrections] or None,
             **_clock_figures(found),
         },
     )
