@@ -257,10 +257,11 @@ def query(
 
 def _limits(answer: dict[str, Any]) -> str:
     """What a device has to follow: how fast the force changes, and how stiff the fixture is."""
-    rate, allowed = answer["force_rate_n_per_ms"], answer["stiffness_limit_n_per_m"]
+    from pipeline.field.query import stiffness_words
+
+    rate = answer["force_rate_n_per_ms"]
     changing = "" if rate is None else f", changing by {rate:.4f} N/ms"
-    most = "" if allowed is None else f" of {allowed:.0f}"
-    return f"{changing}, stiffness {answer['stiffness_n_per_m']:.0f}{most} N/m"
+    return f"{changing}, {stiffness_words(answer)}"
 
 
 def _ask(
@@ -294,12 +295,12 @@ def verify(field: Path, /, *, surfaces: Path | None = None) -> int:
 
     print(f"{field}: {verify_field(field)}")
     if surfaces is not None:
+        from pipeline.field.verify import certificate_rows
         from pipeline.own_surfaces import measure_field
 
         measured = measure_field(field, surfaces, Console().progress)
-        for name, value in measured.items():
-            if name not in {"structures", "fixtures"} and value is not None:
-                print(f"{name:36} {value:.6g}")
+        for name, text in certificate_rows(measured):
+            print(f"{name:36} {text}")
     return 0
 
 

@@ -309,7 +309,14 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
     assert measured["sign_errors"] == 0
     assert said["surface_error_p99_mm"] / 2 < measured["surface_error_p99_mm"] < 1.0
     assert main(["verify", str(baked), "--surfaces", str(folder)]) == 0
-    assert "surface_error_p99_mm" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "surface_error_p99_mm" in printed
+    # Each fixture's own figures on its own line, and no largest over all of them.
+    assert "\nforce_" not in printed
+    for name, one in measured["fixtures"].items():
+        law, most = one["stiffness_n_per_m"], one["stiffness_measured_n_per_m"]
+        line = next(line for line in printed.splitlines() if line.startswith(name))
+        assert f"{law:.0f} N/m by its law, at most {most:.0f} as measured" in line
     (folder / "box_002.ply").unlink()
     with pytest.raises(InputError, match="has 3"):
         measure_field(baked, folder)

@@ -18,7 +18,7 @@ from pipeline.field import Fixture, ForceField, kernels
 from pipeline.field.bake import bake_field
 from pipeline.field.manifest import write_manifest
 from pipeline.field.potential import direction_scale, offence, potential, pull
-from pipeline.field.query import query_point
+from pipeline.field.query import query_point, stiffness_words
 from pipeline.geometry import Float
 
 places = st.floats(-38, 38)
@@ -338,6 +338,14 @@ def test_query_says_what_the_device_has_to_follow(path, field):
     assert 0 < answer["force_rate_n_per_ms"] <= 3 * 0.015 * 0.386
     assert answer["stiffness_n_per_m"] == FIXTURES["guide"].stiffness_n_per_m
     assert answer["stiffness_limit_n_per_m"] == 400
+    certified = field.accuracy["fixtures"]["guide"]["stiffness_measured_n_per_m"]
+    assert answer["stiffness_measured_n_per_m"] == certified
+    assert stiffness_words(answer) == (
+        f"stiffness 386 N/m by its law, at most {certified:.0f} as measured; the device renders 400"
+    )
+    alone = {"stiffness_n_per_m": 386.0, "stiffness_measured_n_per_m": None}
+    said = stiffness_words({**alone, "stiffness_limit_n_per_m": None})
+    assert said == "stiffness 386 N/m by its law"
 
 
 def test_a_store_with_a_fixture_that_its_device_cannot_render_is_refused(path, tmp_path):

@@ -17,11 +17,12 @@ from PIL import Image
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.labels import LABELS
-from pipeline.report import curves, heart, slices
+from pipeline.report import certificate, curves, heart, slices
 from pipeline.report.animation import HEAD, ROOM, TOWARDS_VIEWER, even_in_time, framing
+from pipeline.report.colours import STYLES
 from pipeline.report.moments import MARGIN_PIXELS, Moments
 from pipeline.report.page import figure_row, render
-from pipeline.report.style import STYLES, as_png, as_svg, as_webp
+from pipeline.report.style import as_png, as_svg, as_webp
 
 PAGE_LIMIT_BYTES = 6_000_000
 
@@ -317,3 +318,34 @@ def test_figures_are_shown_with_their_units_and_no_more_digits_than_they_are_wor
     name: str, value: object, row: tuple[str, str]
 ) -> None:
     assert figure_row(name, value) == row
+
+
+def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
+    """The largest over both fixtures are those of different ones, so they are not shown."""
+    soft = {
+        "stiffness_n_per_m": 321.4,
+        "stiffness_measured_n_per_m": 391.2,
+        "stiffness_any_direction_p99_n_per_m": 323.0,
+        "stiffness_limit_n_per_m": 400.0,
+        "beyond_limit_share": 0.0019,
+        "force_step_max_n_per_0_1_mm": 0.4284,
+        "force_change_max_n_per_ms": 0.153,
+    }
+    stiff = {
+        **soft,
+        "stiffness_n_per_m": 384.1,
+        "stiffness_measured_n_per_m": 524.6,
+        "stiffness_limit_n_per_m": None,
+        "beyond_limit_share": None,
+        "force_change_max_n_per_ms": None,
+    }
+    largest = {name: max(soft[name], stiff[name] or 0.0) for name in soft}
+    forces, surfaces = certificate.tables(
+        {"sign_errors": 0, **largest, "structures": {}, "fixtures": {"soft": soft, "stiff": stiff}}
+    )
+    assert forces.rows == [
+        ("soft", "321", "391", "323", "400", "0.2%", "0.43", "0.153"),
+        ("stiff", "384", "525", "323", "unknown", "unknown", "0.43", "unknown"),
+    ]
+    assert len(forces.head) == len(forces.rows[0])
+    assert surfaces.rows == [("sign errors", "0")]

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from data_synth.ecg import EcgSignal
 from data_synth.kernels import Float
-from data_synth.preview.style import STYLES, words
+from data_synth.preview.style import STYLES, edged, words
 
 STRIP_S = 8.0
 CURVES = {
@@ -36,7 +36,8 @@ def volume_curves(phases: Float, volumes_ml: Mapping[str, Sequence[float]]) -> F
     for name, label in CURVES.items():
         colour, style = STYLES[label]
         closed = [*volumes_ml[name], volumes_ml[name][0]]
-        axis.plot([*phases, 1.0], closed, style, color=colour, linewidth=2, label=words(label))
+        (line,) = axis.plot([*phases, 1.0], closed, style, color=colour, label=words(label))
+        line.set(linewidth=2, path_effects=edged(2))
     axis.set(xlabel="phase of the cycle (0 at the R peak)", ylabel="volume (ml)")
     axis.set(xlim=(0, 1), ylim=(0, None))
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))

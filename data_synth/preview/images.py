@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from data_synth.heart import BeatingHeart
 from data_synth.kernels import Label
 from data_synth.mr import SyntheticCine
-from data_synth.preview.style import STYLES, encode, words
+from data_synth.preview.style import STYLES, edged, encode, words
 from data_synth.tissue import TRUTH_LABELS, truth_values
 from data_synth.truth import mr_from_image
 from data_synth.ultrasound import Sweep
@@ -180,7 +180,7 @@ def _contours(axis: Axes, labels: Label, x: Any, y: Any) -> None:
 
 def _legend(figure: Figure) -> None:
     handles = [
-        Line2D([], [], color=colour, linestyle=style, label=words(name))
+        Line2D([], [], color=colour, linestyle=style, label=words(name), path_effects=edged(1.5))
         for name, (colour, style) in STYLES.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8)

@@ -19,14 +19,16 @@ import numpy.typing as npt
 
 from data_synth.kernels import Float
 from data_synth.meshes import Mesh
+from data_synth.preview.style import STYLES
 
+# The muscle is grey: shades of its light blue would be taken for the aorta's blue.
 COLOURS = {
-    "epicardium": "#C8625A",
-    "lv_endocardium": "#E69F00",
-    "rv_endocardium": "#009E73",
-    "left_atrium": "#E8CE3A",
-    "right_atrium": "#CC79A7",
-    "aorta": "#D55E00",
+    "epicardium": "#A0A0A0",
+    "lv_endocardium": STYLES["lv_cavity"][0],
+    "rv_endocardium": STYLES["rv_cavity"][0],
+    "left_atrium": STYLES["left_atrium"][0],
+    "right_atrium": STYLES["right_atrium"][0],
+    "aorta": STYLES["aorta"][0],
 }
 SHORT = {
     "epicardium": "LV",
@@ -42,7 +44,8 @@ NAMED = {
     "cut": ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium"),
 }
 """View -> meshes that bear their short name in it: those that are seen from there."""
-PROBES = ("#0072B2", "#222222", "#7B3294", "#D55E00")
+PROBES = ("#222222", "#7B3294", "#8C510A")
+"""Of sweeps: none is that of a chamber."""
 SIZE_PIXELS = (460, 460)
 TIME_LIMIT_S = 120
 # LPS: left is +x, anterior is -y, head is +z.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.field.exact import ExactSurface, points_about
 from pipeline.field.fixture import DEVICES, Bounds, Fixture
 from pipeline.field.motion import BeatingSurface, Motion, halfway
 from pipeline.field.reader import ForceField
+from pipeline.field.stiffness import STEP_MM, field_rates_n_per_m
 from pipeline.field.threads import processors
 from pipeline.geometry import Float, Surface
 
@@ -25,7 +27,7 @@ BAND_MM = 15.0
 DIRECTION_BAND_MM = 5.0
 DIRECTION_SAMPLES = 60
 """Directions are checked nearer, at fewer points: there the fixtures act."""
-STEP_MM, STEP_MS = 0.1, 1.0
+STEP_MS = 1.0
 CLEAR_GRADIENT = 0.5
 """Where the gradient is as long as this, the force has the size that the law gives it: it is
 shorter about the medial axis alone, where the force passes through zero."""
@@ -229,6 +231,21 @@ def _largest(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True, slots=True)
+class _Sampled:
+    """What random places about the surface had between one phase and the next."""
+
+    step_n: float
+    """Largest change of force over 0.1 mm."""
+    late_n: float | None
+    """Largest change over 1 ms; None where the heartbeat's duration is unknown."""
+    stiffness_n_per_m: float
+    """Largest change of the force's size along its own line."""
+    gradient_longest: float
+    holding_n_per_m: Float
+    """Stiffness of every place in the direction in which it is largest."""
+
+
 class _ForceSteps:
     """Largest steps of one fixture's force, gathered phase by phase in their order."""
 
@@ -244,7 +261,7 @@ class _ForceSteps:
         self._before_n: Float | None = None
         self._steps_n = np.zeros((2, 3))
         self._changes_n: list[float] = []
-        self._samples_n: list[tuple[float, float | None, float]] = []
+        self._sampled: list[_Sampled] = []
 
     def add(self, index: int) -> None:
         """Measure phase ``index``, and the change to it from the phase before."""
@@ -259,7 +276,7 @@ class _ForceSteps:
             self._changes_n.append(float(largest_change(self._before_n, force_n)))
         self._first_n = force_n if self._first_n is None else self._first_n
         self._before_n = force_n
-        self._samples_n.append(self._small_steps(index))
+        self._sampled.append(self._sample(index))
 
     def _forces(self, index: int) -> Float:
         grid = self._volume.grid
@@ -267,13 +284,12 @@ class _ForceSteps:
         phase = self._volume.phases[index]
         return self._volume.force_n(nodes_mm, phase, self._name).reshape(*grid.shape, 3)
 
-    def _small_steps(self, index: int) -> tuple[float, float | None, float]:
-        """Largest change of force over 0.1 mm and over 1 ms, and stiffness, N/m."""
+    def _sample(self, index: int) -> _Sampled:
+        """Changes of force over 0.1 mm and over 1 ms, between this phase and the next."""
         rng = np.random.default_rng(index)
         volume, name = self._volume, self._name
         surface = self._surface.at(index)
         points_mm = points_about(surface, rng, FORCE_SAMPLES, self._near_mm + BAND_MM)
-        # Between this phase and the next.
         phases = volume.phases
         length = (phases[(index + 1) % len(phases)] - phases[index]) % 1 or 1.0
         moments = phases[index] + length * rng.uniform(size=len(points_mm))
@@ -285,22 +301,26 @@ class _ForceSteps:
         if volume.rr_s is not None:
             after_n = volume.force_n(points_mm, moments + STEP_MS / 1000 / volume.rr_s, name)
             late = float(np.linalg.norm(after_n - here_n, axis=1).max())
-        return float(step_n.max()), late, self._stiffness(points_mm, moments, here_n)
+        stiffness, longest = self._along(points_mm, moments, here_n)
+        holding = field_rates_n_per_m(volume, points_mm, moments, name)[:, -1]
+        return _Sampled(float(step_n.max()), late, stiffness, longest, holding)
 
-    def _stiffness(self, points_mm: Float, moments: Float, here_n: Float) -> float:
-        """Largest change of the force's size along its own line, N/m, off the medial axis.
+    def _along(self, points_mm: Float, moments: Float, here_n: Float) -> tuple[float, float]:
+        """Largest change of the force's size along its own line, N/m, off the medial axis, and the
+        longest gradient there, which is what it may exceed the law by.
 
         Its direction turns too, fastest about the medial axis; that is the rate's part.
         """
         structure = self._fixture.structure
         gradient = self._volume.gradient(points_mm, moments, structure)
-        length = np.linalg.norm(gradient, axis=1, keepdims=True)
-        ahead_mm = points_mm + STEP_MM * gradient / np.maximum(length, 1e-9)
-        there = self._volume.gradient(ahead_mm, moments, structure)
-        clear = np.minimum(length[:, 0], np.linalg.norm(there, axis=1)) >= CLEAR_GRADIENT
+        length = np.linalg.norm(gradient, axis=1)
+        ahead_mm = points_mm + STEP_MM * gradient / np.maximum(length, 1e-9)[:, None]
+        there = np.linalg.norm(self._volume.gradient(ahead_mm, moments, structure), axis=1)
+        clear = np.minimum(length, there) >= CLEAR_GRADIENT
         ahead_n = np.linalg.norm(self._volume.force_n(ahead_mm, moments, self._name), axis=1)
         change_n = np.abs(ahead_n - np.linalg.norm(here_n, axis=1))[clear]
-        return 1000 * float(change_n.max(initial=0.0)) / STEP_MM
+        longest = float(np.maximum(length, there)[clear].max(initial=0.0))
+        return 1000 * float(change_n.max(initial=0.0)) / STEP_MM, longest
 
     def result(self) -> dict[str, Any]:
         """The largest steps over space and, the cycle closed, over time."""
@@ -308,20 +328,35 @@ class _ForceSteps:
 
         changes_n = [*self._changes_n, float(largest_change(self._before_n, self._first_n))]
         spacing_mm = np.array(self._volume.grid.spacing_mm)
-        steps, lates, slopes = zip(*self._samples_n, strict=True)
+        found = self._sampled
+        steps, slopes = [one.step_n for one in found], [one.stiffness_n_per_m for one in found]
+        lates = [one.late_n for one in found]
+        change_n = None if None in lates else [one for one in lates if one is not None]
         return {
             "force_step_max_n": float(self._steps_n[0].max()),
             "force_step_max_n_per_mm": float((self._steps_n[0] / spacing_mm).max()),
             "force_step_near_surface_n_per_mm": float((self._steps_n[1] / spacing_mm).max()),
             "force_change_max_n": max(changes_n),
-            "force_change_max_n_per_ms": None if None in lates else max(lates) / STEP_MS,
+            "force_change_max_n_per_ms": None if change_n is None else max(change_n) / STEP_MS,
             "force_step_max_n_per_0_1_mm": max(steps),
             "force_rate_max_n_per_mm": max(steps) / STEP_MM,
             "force_rate_bound_n_per_mm": rate_bound_n_per_mm(self._fixture, spacing_mm.min()),
             "stiffness_measured_n_per_m": max(slopes),
             "stiffness_n_per_m": self._fixture.stiffness_n_per_m,
-            "stiffness_limit_n_per_m": DEVICES[self._fixture.device].stiffness_n_per_m,
-            "force_step_max_n_per_0_1_mm_by_phase": list(steps),
-            "force_change_max_n_per_ms_by_phase": None if None in lates else list(lates),
-            "stiffness_measured_n_per_m_by_phase": list(slopes),
+            **self._holding(),
+            "force_step_max_n_per_0_1_mm_by_phase": steps,
+            "force_change_max_n_per_ms_by_phase": change_n,
+            "stiffness_measured_n_per_m_by_phase": slopes,
+        }
+
+    def _holding(self) -> dict[str, Any]:
+        """The stiffness that holds a tool, in whichever direction it is largest, at all places."""
+        limit = DEVICES[self._fixture.device].stiffness_n_per_m
+        holding = np.concatenate([one.holding_n_per_m for one in self._sampled])
+        return {
+            "stiffness_limit_n_per_m": limit,
+            "gradient_longest": max(one.gradient_longest for one in self._sampled),
+            "stiffness_any_direction_p99_n_per_m": float(np.percentile(holding, 99)),
+            "stiffness_any_direction_max_n_per_m": float(holding.max()),
+            "beyond_limit_share": None if limit is None else float((holding > limit).mean()),
         }

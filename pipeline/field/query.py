@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,9 @@ def query_point(
     By fixture: ``structure``, ``distance_mm``, ``potential``, ``force_n`` (x, y, z) and
     ``inside_grid``, False where the answer is that of the grid's nearest boundary point.
     ``force_rate_n_per_ms`` is how quickly the force changes for a tool at rest there, None where
-    the heartbeat's duration is unknown; ``stiffness_n_per_m`` is the fixture's steepest slope, and
-    ``stiffness_limit_n_per_m`` what its device can render, None where that is unknown.
+    the heartbeat's duration is unknown; ``stiffness_n_per_m`` is the fixture's steepest slope,
+    ``stiffness_measured_n_per_m`` the steepest that its certificate found, None where it has none,
+    and ``stiffness_limit_n_per_m`` what its device can render, None where that is unknown.
 
     Raises
     ------
@@ -54,11 +56,33 @@ def query_point(
             "inside_grid": bool(field.contains(points)[0]),
             "force_rate_n_per_ms": _force_rate(field, point_mm, phase, name),
             "stiffness_n_per_m": law.stiffness_n_per_m,
+            "stiffness_measured_n_per_m": _measured(field, name),
             "stiffness_limit_n_per_m": DEVICES[law.device].stiffness_n_per_m,
         }
         for name, law in field.fixtures.items()
         if fixture in (None, name)
     }
+
+
+def stiffness_words(figures: Mapping[str, Any]) -> str:
+    """A fixture's stiffness in words: by its law, as measured, and what its device can render.
+
+    >>> found = {"stiffness_n_per_m": 321.4, "stiffness_measured_n_per_m": 391.2}
+    >>> stiffness_words({**found, "stiffness_limit_n_per_m": 400.0})
+    'stiffness 321 N/m by its law, at most 391 as measured; the device renders 400'
+    """
+    measured, limit = figures["stiffness_measured_n_per_m"], figures["stiffness_limit_n_per_m"]
+    found = "" if measured is None else f", at most {measured:.0f} as measured"
+    most = "" if limit is None else f"; the device renders {limit:.0f}"
+    return f"stiffness {figures['stiffness_n_per_m']:.0f} N/m by its law{found}{most}"
+
+
+def _measured(field: ForceField, name: str) -> float | None:
+    """The fixture's stiffness by the field's certificate, N/m."""
+    found: float | None = (
+        field.accuracy.get("fixtures", {}).get(name, {}).get("stiffness_measured_n_per_m")
+    )
+    return found
 
 
 def _force_rate(

@@ -15,6 +15,7 @@ from pipeline.field.files import map_phase, read_metadata
 from pipeline.field.manifest import MANIFEST, canonical_manifest, entry
 from pipeline.field.metadata import FieldMetadata, FixturePart, StructurePart
 from pipeline.field.potential import offence, potential
+from pipeline.field.query import stiffness_words
 from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.geometry import Float, Grid
 
@@ -90,6 +91,30 @@ def verify_field(path: Path, progress: Callable[[int, int], None] | None = None)
         structures=tuple(metadata.structures),
         fixtures=tuple(metadata.fixtures),
     )
+
+
+def certificate_rows(accuracy: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """A certificate in words: a name and its figures, fixture by fixture at the end.
+
+    The largest over all fixtures are left out: side by side they are those of different fixtures.
+    """
+    fixtures: Mapping[str, Mapping[str, Any]] = accuracy["fixtures"]
+    left_out = {"structures", "fixtures"}.union(*fixtures.values())
+    rows = [
+        (name, f"{value:.6g}")
+        for name, value in accuracy.items()
+        if name not in left_out and value is not None
+    ]
+    return rows + [(name, _fixture_words(one)) for name, one in fixtures.items()]
+
+
+def _fixture_words(one: Mapping[str, Any]) -> str:
+    beyond, late = one["beyond_limit_share"], one["force_change_max_n_per_ms"]
+    holding = f"{one['stiffness_any_direction_p99_n_per_m']:.0f} in any direction at 99 % of places"
+    share = "" if beyond is None else f", {beyond:.2%} are beyond the device"
+    step = f"force changes by at most {one['force_step_max_n_per_0_1_mm']:.3f} N over 0.1 mm"
+    time = "" if late is None else f", {late:.3f} N over 1 ms"
+    return f"{stiffness_words(one)}; {holding}{share}; {step}{time}"
 
 
 def _refuse(path: Path, problems: list[str]) -> None:

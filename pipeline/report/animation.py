@@ -17,14 +17,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry import Float, Float32, MovingSurface
+from pipeline.report.colours import SOLID_COLOURS
 
-COLOURS = {
-    "epicardium": "#C0504D",
-    "rv_endocardium": "#009E73",
-    "left_atrium": "#D9B800",
-    "right_atrium": "#CC79A7",
-    "aorta": "#D55E00",
-}
 FRAMES = 20
 SIZE_PIXELS = (520, 520)
 TIME_LIMIT_S = 300
@@ -55,7 +49,7 @@ def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> byte
 def _hand_over(path: Path, surfaces: Mapping[str, MovingSurface]) -> None:
     arrays: dict[str, Any] = {}
     for name, moving in surfaces.items():
-        if name in COLOURS:
+        if name in SOLID_COLOURS:
             arrays[f"{name}.vertices"] = even_in_time(moving, FRAMES)
             arrays[f"{name}.triangles"] = moving.triangles
     np.savez(path, **arrays)
@@ -125,7 +119,7 @@ def _draw(work: Path) -> None:
             arrays[f"{name}.vertices"][0], arrays[f"{name}.triangles"]
         )
         meshes[name] = mesh
-        plotter.add_mesh(mesh, color=COLOURS[name])
+        plotter.add_mesh(mesh, color=SOLID_COLOURS[name])
     everything = [arrays[f"{name}.vertices"].reshape(-1, 3) for name in names]
     centre_mm, half_mm = framing(np.concatenate(everything))
     plotter.view_vector(TOWARDS_VIEWER, viewup=HEAD)

@@ -9,7 +9,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from pipeline.geometry import Float, Integer, MovingSurface
-from pipeline.report.animation import COLOURS, HEAD, TOWARDS_VIEWER
+from pipeline.report.animation import HEAD, TOWARDS_VIEWER
+from pipeline.report.colours import SOLID_COLOURS
 
 # Light from the viewer; what turns away keeps this much of it, so that colours can be read.
 _LEAST_LIGHT = 0.7
@@ -24,7 +25,7 @@ def expected_error(surfaces: Mapping[str, MovingSurface], error_mm: ErrorAt) -> 
     corners = np.concatenate(
         [
             surfaces[name].at(0).vertices_mm[surfaces[name].triangles]
-            for name in COLOURS
+            for name in SOLID_COLOURS
             if name in surfaces
         ]
     )

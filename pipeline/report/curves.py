@@ -10,10 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.geometry import Float
-from pipeline.report.style import SURFACE_STYLES, words
+from pipeline.report.colours import STYLES, SURFACE_STYLES
+from pipeline.report.style import edged, words
 
 CHAMBERS = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium")
-MUSCLE_COLOUR = "#56B4E9"
+MUSCLE_COLOUR = STYLES["lv_myocardium"][0]
+LINE_POINTS = 2.0
 FEW_PHASES = 12
 PHASE_AXIS = "phase of the cycle (0 at the R peak)"
 
@@ -81,7 +83,8 @@ def _cyclic(
         linestyle=style,
         color=colour,
         label=label,
-        linewidth=2,
+        linewidth=LINE_POINTS,
+        path_effects=edged(LINE_POINTS),
         marker=marker,
         markersize=4,
     )

@@ -77,6 +77,22 @@ def figure_row(name: str, value: object) -> tuple[str, str]:
     return words, f"{text} {UNITS.get(ending, '')}".strip()
 
 
+def flat_table(title: str, figures: Mapping[str, Any]) -> Table:
+    """Single figures as rows; what is told per phase or structure stays in the JSON files."""
+    rows: list[tuple[str, str]] = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            # The unit stands at the end of the group's name, for all of its figures.
+            words, unit = figure_row(name, "")
+            rows += [
+                (f"{words} {part}", f"{text} {unit}".rstrip())
+                for part, text in (figure_row(*one) for one in value.items() if is_single(one[1]))
+            ]
+        elif is_single(value):
+            rows.append(figure_row(name, value))
+    return Table((title, ""), rows)
+
+
 def render(
     patient_id: str,
     summary: Sequence[tuple[str, str]],

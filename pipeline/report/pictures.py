@@ -15,8 +15,9 @@ from pipeline.field.potential import potential
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, Float32, MovingSurface, Surface, transform_points
 from pipeline.imaging.labels import LABELS
+from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
-from pipeline.report.style import SURFACE_STYLES, handle, show_grey, words
+from pipeline.report.style import handle, show_grey, words
 
 
 def fixture_profiles(fixtures: Mapping[str, Fixture]) -> Figure:

@@ -14,8 +14,9 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.geometry import Float, Integer, Label
 from pipeline.imaging.labels import LABELS
+from pipeline.report.colours import STYLES
 from pipeline.report.moments import Moments
-from pipeline.report.style import STYLES, handle, show_grey
+from pipeline.report.style import handle, show_grey
 
 MOST_SLICES = 24
 """More than these are not shown one by one: a choice of those with heart is."""

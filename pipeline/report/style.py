@@ -1,4 +1,4 @@
-"""What the report's pictures share: colours, names, and files that repeat to the byte."""
+"""What the report's pictures share: lines, names, and files that repeat to the byte."""
 
 from __future__ import annotations
 
@@ -10,24 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-
-# Okabe and Ito's colours, told apart by colour-blind readers; line styles serve greyscale.
-STYLES: dict[str, tuple[str, Any]] = {
-    "lv_cavity": ("#E69F00", "-"),
-    "lv_myocardium": ("#56B4E9", "--"),
-    "rv_cavity": ("#009E73", "-."),
-    "left_atrium": ("#D9B800", ":"),
-    "right_atrium": ("#CC79A7", "-"),
-    "aorta": ("#D55E00", "--"),
-}
-SURFACE_STYLES = {
-    "lv_endocardium": STYLES["lv_cavity"],
-    "epicardium": STYLES["lv_myocardium"],
-    "rv_endocardium": STYLES["rv_cavity"],
-    "left_atrium": STYLES["left_atrium"],
-    "right_atrium": STYLES["right_atrium"],
-    "aorta": STYLES["aorta"],
-}
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 
 
 def as_svg(figure: Figure) -> bytes:
@@ -59,9 +42,14 @@ def show_grey(axis: Axes, image: Any, aspect: float = 1.0) -> None:
     axis.set_axis_off()
 
 
+def edged(width: float) -> list[AbstractPathEffect]:
+    """A thin grey edge on both sides of a line: without it yellow is lost on white."""
+    return [Stroke(linewidth=width + 1, foreground="#555555"), Normal()]
+
+
 def handle(name: str, colour: str, style: Any) -> Line2D:
     """An entry of a legend."""
-    return Line2D([], [], color=colour, linestyle=style, label=words(name))
+    return Line2D([], [], color=colour, linestyle=style, label=words(name), path_effects=edged(1.5))
 
 
 def words(name: str) -> str:

@@ -14,10 +14,11 @@ from pipeline.imaging.ultrasound import read_sweep
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.publish import sealed
+from pipeline.registration.correction import put_right
 from pipeline.registration.uncertainty import expected_tre_mm
-from pipeline.report import certainty, heart, pictures
+from pipeline.report import certainty, certificate, heart, pictures
 from pipeline.report.moments import Moments
-from pipeline.report.page import Section, Table, figure_row, is_single, picture, render
+from pipeline.report.page import Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
 
@@ -97,7 +98,7 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     if job.product("register"):
         register = figures_of(job, "register")
         rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
-        said = [register["verdict"], register["reason"]]
+        said = [register["verdict"], register["reason"], register["calibration"]]
         rows.append(("registration", "; ".join(filter(None, said))))
         expected_mm = register["expected_tre_mm"]
         rows.append(("expected registration error over the heart", f"{expected_mm:.1f} mm"))
@@ -131,9 +132,13 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     sweeps = {path.stem: read_sweep(path) for path in job.study.us.sweeps}
     # Probes differ, and so may the sizes of their pictures.
     images = [sweeps[row.sweep].images[row.frame] for row in chosen]
+    tracker_from_image = {
+        name: put_right(sweep.tracker_from_image, name, found["calibration"])
+        for name, sweep in sweeps.items()
+    }
     image_from_mr = np.stack(
         [
-            np.linalg.inv(mr_from_tracker @ sweeps[row.sweep].tracker_from_image[row.frame])
+            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][row.frame])
             for row in chosen
         ]
     )
@@ -189,29 +194,14 @@ def _field(job: Job, shown: Moments) -> Section:
         "errors are places taken for the wrong side; drift is how far the surface lies off halfway "
         "between two phases; the band is what lies within it of the surface. A device has to "
         "render the fixture's stiffness, which is below its limit; what is measured exceeds it at "
-        "single places beside a medial axis, where two parts of the surface are equally near.",
+        "single places beside a medial axis, where two parts of the surface are equally near, and "
+        "where the force changes with place as fast as the grid's spacing allows.",
         [
             picture("Potential, distance and force", as_png(figure), "png"),
             picture("Force of each fixture", as_svg(profiles), "svg"),
         ],
-        [Table(head, rows), _flat("accuracy certificate", figures_of(job, "bake")["accuracy"])],
+        [Table(head, rows), *certificate.tables(figures_of(job, "bake")["accuracy"])],
     )
-
-
-def _flat(title: str, figures: dict[str, Any]) -> Table:
-    """Single figures as rows; what is told per phase or structure stays in the JSON files."""
-    rows: list[tuple[str, str]] = []
-    for name, value in figures.items():
-        if isinstance(value, dict):
-            # The unit stands at the end of the group's name, for all of its figures.
-            words, unit = figure_row(name, "")
-            rows += [
-                (f"{words} {part}", f"{text} {unit}".rstrip())
-                for part, text in (figure_row(*one) for one in value.items() if is_single(one[1]))
-            ]
-        elif is_single(value):
-            rows.append(figure_row(name, value))
-    return Table((title, ""), rows)
 
 
 def _evaluation(job: Job) -> list[Section]:
@@ -227,7 +217,7 @@ def _evaluation(job: Job) -> list[Section]:
         Section(
             "Against truth",
             "This study is synthetic, so its truth is known; only the evaluate stage reads it.",
-            tables=[Table(head, rows), _flat("registration and volumes", others)],
+            tables=[Table(head, rows), flat_table("registration and volumes", others)],
         )
     ]
 

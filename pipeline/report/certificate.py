@@ -1,0 +1,40 @@
+"""The certificate of a field as people read it: its distances, and each fixture's forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.report.page import Table, flat_table
+
+COLUMNS = {
+    "stiffness_n_per_m": ("by its law N/m", "{:.0f}"),
+    "stiffness_measured_n_per_m": ("measured N/m", "{:.0f}"),
+    "stiffness_any_direction_p99_n_per_m": ("in any direction, p99 N/m", "{:.0f}"),
+    "stiffness_limit_n_per_m": ("device renders N/m", "{:.0f}"),
+    "beyond_limit_share": ("places beyond that", "{:.1%}"),
+    "force_step_max_n_per_0_1_mm": ("most over 0.1 mm N", "{:.2f}"),
+    "force_change_max_n_per_ms": ("most over 1 ms N", "{:.3f}"),
+}
+"""What is told of each fixture, in this order: a head, and how the figure is written."""
+
+
+def tables(accuracy: Mapping[str, Any]) -> list[Table]:
+    """Forces by fixture, each beside its own law and device; then what is told of the surfaces.
+
+    The largest force figures over all fixtures, which the field's description holds as well, are
+    left out: side by side they would be those of different fixtures.
+    """
+    fixtures: Mapping[str, Mapping[str, Any]] = accuracy["fixtures"]
+    of_forces = {name for one in fixtures.values() for name in one}
+    rest = {name: value for name, value in accuracy.items() if name not in of_forces}
+    rows = [
+        (name, *(_written(one[column], style) for column, (_, style) in COLUMNS.items()))
+        for name, one in fixtures.items()
+    ]
+    head = ["stiffness and steps of force", *(head for head, _ in COLUMNS.values())]
+    return [Table(head, rows), flat_table("accuracy certificate", rest)]
+
+
+def _written(value: float | None, style: str) -> str:
+    return "unknown" if value is None else style.format(value)
