@@ -19,7 +19,8 @@ from pipeline.geometry import Float, Float32, MovingSurface, transform_points
 from pipeline.imaging.ultrasound import read_sweep
 from pipeline.paper.moving import animated
 from pipeline.paper.subject import Subject
-from pipeline.products import read_frames, read_surfaces
+from pipeline.products import read_frames, read_surfaces, read_table
+from pipeline.registration.correction import put_right
 from pipeline.report.page import Section, picture
 from pipeline.report.pictures import plane_cut
 from pipeline.report.style import as_webp, show_grey
@@ -107,7 +108,9 @@ def _scene(subject: Subject, field: ForceField, structure: str) -> Scene:
     ]  # fmt: skip
     frames = [row.frame for row in rows]
     assert field.mr_from_tracker is not None
-    mr_from_image = field.mr_from_tracker @ sweep.tracker_from_image[frames]
+    found = read_table(subject.products / "register" / "mr_from_tracker.json")
+    tracker_from_image = put_right(sweep.tracker_from_image, sweep.name, found.get("calibration"))
+    mr_from_image = field.mr_from_tracker @ tracker_from_image[frames]
     image_from_mr: Float = np.linalg.inv(mr_from_image).astype(np.float64)
     times_s, phases = np.array([r.time_s for r in rows]), np.array([r.phase for r in rows])
     line_mm = _line(field, structure, image_from_mr, sweep.images.shape[1:], float(phases[0]))
