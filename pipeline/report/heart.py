@@ -73,8 +73,8 @@ def movement(
     animation = beating_surfaces(surfaces, rr_s)
     if animation is not None:
         caption = (
-            "One heartbeat, seen from the front left: muscle red, right ventricle green, atria "
-            "yellow (left) and pink, aorta orange"
+            "One heartbeat, seen from the front left: left ventricle orange, right ventricle "
+            "green, atria yellow (left) and pink, aorta blue"
         )
         shown.append(picture(caption, animation, "webp"))
     volumes = as_svg(curves.volume_curves(phases, measures["volumes_ml"]))
