@@ -44,7 +44,7 @@ paper: $(READY) ## the paper's figures and table, re-run from the demo's field: 
 	$(BIN)/beatfield paper paper --products $(OUT)/patient-0001 --study $(STUDY)
 
 test: setup ## run all tests
-	$(BIN)/pytest -n 2 --dist worksteal -q
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
 
 check: lint types test ## all that CI runs: lint, types, test
 

@@ -108,9 +108,10 @@ def test_force_at_the_handle_never_exceeds_that_of_the_fixture(room):
 def test_same_seed_gives_the_same_table_and_another_overlaps(room):
     conditions = [Condition("point", True), Condition("point", True, OMEGA)]
     one = run_all(room, conditions, 1, 16)
-    again = run_all(room, conditions, 1, 16)
     other = run_all(room, conditions, 7, 16)
-    assert np.array_equal(one, again)
+    # Each operator is the same whatever the others, and the threads that serve them.
+    again = run_all(room, conditions, 1, 4)
+    assert np.array_equal(one[:, :4], again)
     assert not np.array_equal(one, other)
     for first, second in zip(one, other, strict=True):
         (a, da), (b, db) = interval(first[:, Sum.TIME]), interval(second[:, Sum.TIME])

@@ -36,7 +36,7 @@ NORMAL = {
 POOLED = {"lv_ml": (147.5, 27.5), "lv_ejection": (0.595, 0.05), "rv_ml": (169, 34)}
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=32)
 def measured(seed: int, pathology: str = "healthy") -> Drawn:
     """A heart, the person it belongs to, and what is measured on its meshes."""
     heart = draw_heart(np.random.default_rng([7, seed]), pathology=pathology)
@@ -51,7 +51,7 @@ def measured(seed: int, pathology: str = "healthy") -> Drawn:
 
 @pytest.fixture(scope="module")
 def healthy() -> list[Drawn]:
-    return [measured.__wrapped__(seed) for seed in range(HEALTHY)]
+    return [measured(seed) for seed in range(HEALTHY)]
 
 
 def test_both_sexes_are_drawn(healthy):
