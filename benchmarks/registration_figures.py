@@ -106,7 +106,7 @@ def registered(
         "covariance": found.covariance.tolist(),
         "confidence": found.confidence,
         "rival": found.rival,
-        "valid": float(found.valid.mean()),
+        "valid": float(found.valid.sum() / max((found.residual < 1).sum(), 1)),
         "verdict": found.verdict,
         "reason": found.reason,
         "wall_s": wall_s,

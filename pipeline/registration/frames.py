@@ -13,6 +13,7 @@ from scipy.stats import rankdata
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer, Mask
+from pipeline.registration.contact import Contact
 
 
 class TrackedSweep(Protocol):
@@ -56,6 +57,9 @@ class Lattice:
     brightest: float
     """Largest grey value of the sweep."""
 
+    contact: Contact
+    """Whether a picture shows a body, or a probe in air."""
+
 
 @dataclass(frozen=True, slots=True)
 class Samples:
@@ -96,7 +100,7 @@ def sample_frames(
     smoothing_mm: float,
     trend_mm: float,
 ) -> Samples:
-    """Samples of every frame whose pose is known and whose picture is not flat.
+    """Samples of every frame whose pose is known and whose picture shows a body.
 
     Parameters
     ----------
@@ -112,8 +116,8 @@ def sample_frames(
     Raises
     ------
     InputError
-        When phases do not belong to the frames, a sweep shows no sector, or its transform does
-        not map pixels to millimetres.
+        When phases do not belong to the frames, a sweep shows no sector, its transform does not
+        map pixels to millimetres, or no frame shows a body.
     """
     parts: list[Samples] = []
     offset = 0
@@ -122,6 +126,11 @@ def sample_frames(
         part = _sample_sweep(sweep, own, spacing_mm, smoothing_mm, trend_mm)
         parts.append(replace(part, number=part.number + offset))
         offset += len(own)
+    if not any(part.frames for part in parts):
+        raise InputError(
+            f"none of the {offset} frames shows a body and has a finite pose: all are flat or were "
+            "taken in air; was the probe in contact?"
+        )
     return _join(parts)
 
 
@@ -194,21 +203,22 @@ def lattice_of(
     at = _lattice(sector, pixel_mm, spacing_mm)
     smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
     trend = _trend(at * pixel_mm, trend_mm)
-    return Lattice(at, smoothing, trend, float(sweep.images.max()))
+    contact = Contact.of(sector, pixel_mm)
+    return Lattice(at, smoothing, trend, float(sweep.images.max()), contact)
 
 
 def sample_pictures(
     lattice: Lattice, images: Float32, tracker_from_image: Float, phases: Float, usable: Mask
 ) -> Samples:
-    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that are not flat.
+    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that show a body.
 
     A sample's grey value is its rank among the frame's: whatever the scanner's curve from echo to
     grey, a few glaring mirrors count for no more than their number.
     """
     seen = (lattice.smoothing @ images.reshape(len(images), -1).T).T
-    # A flat picture (the probe in air, a dead frame) has rounding errors for contrast.
+    # A flat picture (a dead frame) has rounding errors for contrast.
     lively = seen.std(axis=1) > 1e-3 * max(lattice.brightest, 1e-30)
-    kept = np.flatnonzero(usable & lively)
+    kept = np.flatnonzero(usable & lively & lattice.contact.touching(images))
     rank = rankdata(seen[kept], axis=1) / len(lattice.at)
     grey = rank - (rank @ lattice.trend) @ lattice.trend.T
     spread = np.maximum(grey.std(axis=1), 1e-9)

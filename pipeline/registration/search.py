@@ -20,7 +20,7 @@ from pipeline.registration.pose_search import (
 )
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import Agreement, agreement
-from pipeline.registration.tissue_map import TissueMap, blurred, cavities_of, draw_tissue
+from pipeline.registration.tissue_map import TissueMap, as_seen, blurred, cavities_of, draw_tissue
 
 # The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
 _COARSE_BLUR_MM = 5.0
@@ -168,7 +168,7 @@ def prepare_search(
     InputError
         When there is no cavity, or surfaces and cine have not the same phases.
     """
-    tissue = draw_tissue(surfaces, settings.grid_mm, cine)
+    tissue = as_seen(draw_tissue(surfaces, settings.grid_mm, cine))
     pivot = pivot_of(cavities_of(surfaces))
     coarse = blurred(tissue, _COARSE_BLUR_MM)
     fine = blurred(tissue, settings.smoothing_mm)

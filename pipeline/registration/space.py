@@ -330,7 +330,9 @@ def _summarise(
     frames = sum(sizes)
     covariance, corrections = _covariance(found, search, sizes)
     expected = expected_tre_mm(covariance, pivot.centre_mm, heart_mm)
-    verdict = _verdict(found, search, frames, float(np.sqrt((expected**2).mean())))
+    # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
+    shown = level.samples.frames
+    verdict = _verdict(found, search, shown, float(np.sqrt((expected**2).mean())))
     judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
     residual = np.ones(frames)
     residual[level.samples.number] = 1 - level.at(pose).explained
