@@ -103,10 +103,17 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
     words = [str(word) for word in (path, peaks, *TIP_MM)]
     program = built(tmp_path, "gcc", "-std=c99")
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
+    wrong = subprocess.run([program, *words[:2], "1O", "0", "0"], capture_output=True, check=False)
+    assert wrong.returncode == 2
+    assert b"not finite" in wrong.stderr
     capsys.readouterr()
     _, out, _ = python_server(capsys, path, record, *TIP_MM)
     by_c = table(done.stdout)
-    by_python = table(out)[: len(by_c)]
+    by_python = table(out)
+    # The C server begins when the first peak is known; until then there is no force.
+    first = np.flatnonzero(by_python[:, 0] == by_c[0, 0])[0]
+    assert not by_python[:first, 3:].any()
+    by_python = by_python[first : first + len(by_c)]
     assert len(by_c) > 15_000
     # Peaks come rounded to 10 us, 1.3e-5 of the cycle, and the clock corrects by what it is off;
     # a wall that moves 6 mm in a quarter of the cycle changes the force by 10 N a cycle.
@@ -119,3 +126,19 @@ def test_wrong_words_are_told(path, tmp_path, capsys):
     code, out, err = python_server(capsys, path, tmp_path / "none", *TIP_MM)
     assert (code, out) == (2, "")
     assert "none" in err
+
+
+def test_times_are_those_of_the_recordings_own_clock(tmp_path, path, capsys):
+    """A CSV file whose first sample is at 1000 s."""
+    _, ecg = recorded(tmp_path)
+    times_s = 1000 + np.arange(len(ecg.signal_mv)) / ecg.sampling_rate_hz
+    lines = (
+        f"{time_s:.3f},{one:.4f}" for time_s, one in zip(times_s, ecg.signal_mv[:, 0], strict=True)
+    )
+    (tmp_path / "ecg.csv").write_text("\n".join(["time_s,II", *lines]) + "\n")
+    rows = table(python_server(capsys, path, tmp_path / "ecg.csv", *TIP_MM)[1])
+    assert rows[0, 0] == 1000
+    late = rows[(rows[:, 0] > 1010) & (rows[:, 2] == 1) & (rows[:, 0] < 1000 + ecg.r_times_s[-1])]
+    off = late[:, 1] - phase_at(late[:, 0] - 1000, ecg.r_times_s)
+    assert len(late) > 5000
+    assert np.percentile(np.abs(off - np.round(off)), 90) < 0.04

@@ -23,6 +23,14 @@ typedef struct {
     int strange;
 } peak;
 
+/* A word that is a number and nothing else; not a number (which the field refuses) otherwise. */
+static double number(const char *word)
+{
+    char *end;
+    double value = strtod(word, &end);
+    return end > word && !*end ? value : NAN;
+}
+
 /* The next row of `beatfield rpeaks`; 0 at the end of the file. */
 static int next_peak(FILE *file, peak *found)
 {
@@ -35,7 +43,7 @@ static int next_peak(FILE *file, peak *found)
     return 1;
 }
 
-/* A row a millisecond, until the last peak. */
+/* A row a millisecond, from the moment at which the first peak is known to that of the last. */
 static bf_status serve(const bf_field *field, FILE *peaks, const double tip_mm[3])
 {
     const double fade_per_s = FORCE_RATE_N_PER_S / field->fixture[0].f_max_n;
@@ -45,7 +53,8 @@ static bf_status serve(const bf_field *field, FILE *peaks, const double tip_mm[3
     peak next;
     double force_n[3];
     int more = next_peak(peaks, &next), lead_connected = 1;
-    for (long turn = 0; more && status == BF_OK; turn++) {
+    long turn = more ? (long)ceil(next.known_s * RATE_HZ) : 0;
+    for (; more && status == BF_OK; turn++) {
         double time_s = (double)turn / RATE_HZ;
         /* Times in the file are rounded to 10 us. */
         while (more && next.known_s <= time_s + 1e-5) {
@@ -73,7 +82,7 @@ int main(int count, char **words)
         fprintf(stderr, "use: %s FIELD PEAKS X Y Z (LPS mm)\n", words[0]);
         return 2;
     }
-    for (n = 0; n < 3; n++) tip_mm[n] = atof(words[3 + n]);
+    for (n = 0; n < 3; n++) tip_mm[n] = number(words[3 + n]);
     peaks = fopen(words[2], "r");
     if (!peaks || !fgets(header, sizeof header, peaks)) {
         fprintf(stderr, "error: %s: cannot be read\n", words[2]);

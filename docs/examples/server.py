@@ -25,22 +25,22 @@ Row = tuple[float, float, bool, float, float, float, float]
 
 
 def serve(field: ForceField, ecg: Ecg, tip_mm: tuple[float, float, float]) -> Iterator[Row]:
-    """Time (s), phase, whether it is valid, share of the force that is rendered, force (N)."""
+    """Time (s, as recorded), phase, whether it is valid, share of the force rendered, force (N)."""
     fixture, law = next(iter(field.fixtures.items()))
     clock = PhaseClock(field.rr_s or USUAL_RR_S, f_max_n=law.f_max_n)
     detector = RPeakDetector(ecg.sampling_rate_hz, ecg.signal_mv.shape[1])
     seen = 0
     for turn in range(int(len(ecg.signal_mv) / ecg.sampling_rate_hz * RATE_HZ)):
-        now_s = turn / RATE_HZ
-        arrived = 1 + int(now_s * ecg.sampling_rate_hz + 1e-6)
+        passed_s = turn / RATE_HZ
+        arrived = 1 + int(passed_s * ecg.sampling_rate_hz + 1e-6)
         for beat in detector.push(ecg.signal_mv[seen:arrived]):
             clock.beat(beat.time_s, beat.strange)
         seen = arrived
-        tick = clock.at(now_s, detector.usable)
+        tick = clock.at(passed_s, detector.usable)
         force_n = field.force_at(*tip_mm, tick.phase, fixture)
         # Fading is all that a lost lead, an early beat or fibrillation asks of a server.
         x_n, y_n, z_n = (tick.fade * part for part in force_n)
-        yield now_s, tick.phase, tick.valid, tick.fade, x_n, y_n, z_n
+        yield ecg.start_s + passed_s, tick.phase, tick.valid, tick.fade, x_n, y_n, z_n
 
 
 def main(words: list[str]) -> int:
