@@ -103,9 +103,15 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
     words = [str(word) for word in (path, peaks, *TIP_MM)]
     program = built(tmp_path, "gcc", "-std=c99")
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
-    wrong = subprocess.run([program, *words[:2], "1O", "0", "0"], capture_output=True, check=False)
-    assert wrong.returncode == 2
-    assert b"not finite" in wrong.stderr
+    field, table_of_peaks, *point = words
+    for given, told in (
+        ((field, table_of_peaks, "1O", "0", "0"), b"grid does not hold"),
+        ((field, table_of_peaks, "900", "0", "0"), b"grid does not hold"),
+        ((field, f"{record}.hea", *point), b"no table"),
+    ):
+        wrong = subprocess.run([program, *given], capture_output=True, check=False)
+        assert (wrong.returncode, wrong.stdout) == (2, b"")
+        assert told in wrong.stderr
     capsys.readouterr()
     _, out, _ = python_server(capsys, path, record, *TIP_MM)
     by_c = table(done.stdout)
@@ -123,6 +129,9 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
 
 def test_wrong_words_are_told(path, tmp_path, capsys):
     assert python_server(capsys, path, "nowhere")[0] == 2
+    code, out, err = python_server(capsys, path, tmp_path / "none", 900, 0, 0)
+    assert (code, out) == (2, "")
+    assert "grid does not hold" in err
     code, out, err = python_server(capsys, path, tmp_path / "none", *TIP_MM)
     assert (code, out) == (2, "")
     assert "none" in err

@@ -52,7 +52,8 @@ static bf_status serve(const bf_field *field, FILE *peaks, const double tip_mm[3
     bf_tick now;
     peak next;
     double force_n[3];
-    int more = next_peak(peaks, &next), lead_connected = 1;
+    int more = next_peak(peaks, &next);
+    int lead_connected = 1; /* a monitor tells it; a table of peaks cannot */
     long turn = more ? (long)ceil(next.known_s * RATE_HZ) : 0;
     for (; more && status == BF_OK; turn++) {
         double time_s = (double)turn / RATE_HZ;
@@ -84,11 +85,18 @@ int main(int count, char **words)
     }
     for (n = 0; n < 3; n++) tip_mm[n] = number(words[3 + n]);
     peaks = fopen(words[2], "r");
-    if (!peaks || !fgets(header, sizeof header, peaks)) {
-        fprintf(stderr, "error: %s: cannot be read\n", words[2]);
+    if (!peaks || !fgets(header, sizeof header, peaks) || strncmp(header, "time_s,kind,", 12)) {
+        fprintf(stderr, "error: %s: is no table that `beatfield rpeaks` wrote\n", words[2]);
+        if (peaks) fclose(peaks);
         return 2;
     }
     status = bf_open(&field, words[1]);
+    if (status == BF_OK && !bf_contains(&field, tip_mm)) {
+        fprintf(stderr, "error: %s: its grid does not hold the point; give one near the heart\n", words[1]);
+        bf_close(&field);
+        fclose(peaks);
+        return 2;
+    }
     if (status == BF_OK) {
         bf_lock(&field); /* pages in memory before the loop starts; where not allowed, read at least */
         printf("time_s,phase,valid,fade,x_n,y_n,z_n\n");

@@ -52,7 +52,10 @@ def main(words: list[str]) -> int:
         sys.stderr.write("use: server.py FIELD ECG X Y Z (LPS mm)\n")
         return 2
     try:
-        rows = serve(ForceField.open(path), read_ecg(Path(record)), (x_mm, y_mm, z_mm))
+        field, tip_mm = ForceField.open(path), (x_mm, y_mm, z_mm)
+        if not field.contains([tip_mm])[0]:
+            raise InputError(f"{path}: its grid does not hold the point; give one near the heart")
+        rows = serve(field, read_ecg(Path(record), gaps=True), tip_mm)
         sys.stdout.write("time_s,phase,valid,fade,x_n,y_n,z_n\n")
         for time_s, phase, valid, fade, *force_n in rows:
             forces = ",".join(f"{part:.6f}" for part in force_n)

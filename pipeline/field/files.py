@@ -66,7 +66,8 @@ def require_manifest(path: Path) -> None:
     except FileNotFoundError as error:
         missing = Path(error.filename).name
         raise InputError(
-            f"{path}: has no {missing}, so it is no complete field; bake it again"
+            f"{path}: has no {missing}, so it is no complete field; give "
+            "the field.zarr that bake wrote, or bake it again"
         ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path / MANIFEST}: cannot be read ({error!r}); bake again") from error

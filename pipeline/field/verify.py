@@ -133,7 +133,8 @@ def _read_manifest(source: Path) -> dict[str, dict[str, Any]]:
         whole = raw == canonical_manifest(files)
     except FileNotFoundError as error:
         raise InputError(
-            f"{source.parent}: has no {MANIFEST}, so it is no complete field; bake it again"
+            f"{source.parent}: has no {MANIFEST}, so it is no complete field; give "
+            "the field.zarr that bake wrote, or bake it again"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{source}: is damaged ({error!r}); bake the field again") from error
