@@ -118,8 +118,9 @@ def _summary(record: dict[str, Any], products: Path) -> str:
     ]
     seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
     lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
-    example = record["stages"].get("bake", {}).get("figures", {}).get("example")
-    if example:
+    bake = record["stages"].get("bake", {})
+    example = bake.get("figures", {}).get("example")
+    if example and bake["status"] != "stale":
         point = " ".join(f"{value:g}" for value in example["point_mm"])
         field = products / "bake" / "field.zarr"
         lines.append(
@@ -128,7 +129,8 @@ def _summary(record: dict[str, Any], products: Path) -> str:
     page = products / "report" / "index.html"
     lines.append(f"products  {products}")
     if page.exists():
-        lines.append(f"report    {page}")
+        stale = record["stages"].get("report", {}).get("status") == "stale"
+        lines.append(f"report    {page}" + (" (stale: `beatfield run` renews it)" if stale else ""))
     return "\n".join(lines)
 
 

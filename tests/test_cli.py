@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import main
+from pipeline.cli import _summary, main
 
 
 @pytest.mark.parametrize(
@@ -161,3 +161,15 @@ def test_help_loads_no_heavy_library() -> None:
     )
     for command in ("run", "batch", "bake", "query", "verify", "synth", "segment"):
         assert command in done.stdout
+
+
+@pytest.mark.parametrize("state", ["done", "stale"])
+def test_stale_products_are_not_offered_as_if_they_were_current(tmp_path, state):
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "index.html").touch()
+    example = {"point_mm": [1.0, 2.0, 3.0], "phase": 0.5}
+    stage = {"status": state, "figures": {"example": example}}
+    record = {"status": "done", "stages": {"bake": stage, "report": {"status": state}}}
+    said = _summary(record, tmp_path)
+    assert ("beatfield query" in said) == (state == "done")
+    assert ("stale: " in said) == (state == "stale")

@@ -131,3 +131,9 @@ def test_wrong_questions_about_tools_are_refused(field, tmp_path):
     (tmp_path / "t.yaml").write_text("shape: mesh\npath: none.stl\n")
     with pytest.raises(InputError, match=r"none\.stl"):
         read_tool(tmp_path / "t.yaml").lines_mm()
+
+
+def test_a_wrong_key_is_named_beside_the_missing_one(tmp_path):
+    (tmp_path / "t.yaml").write_text("shape: torus\nradius: 10\n")
+    with pytest.raises(InputError, match=r"(?s)radius_mm: Field required.*radius: unknown key"):
+        read_tool(tmp_path / "t.yaml")

@@ -163,6 +163,8 @@ def read_tool(path: Path | str) -> Tool:
     """
     import yaml
 
+    from pipeline.study import describe_validation
+
     path = Path(path)
     try:
         content = yaml.safe_load(path.read_text())
@@ -170,9 +172,7 @@ def read_tool(path: Path | str) -> Tool:
             content["path"] = path.parent / str(content["path"])
         tool: Tool = TypeAdapter(Tool).validate_python(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "(all)"
-        raise InputError(f"{path}: {place}: {first['msg']} (got {first['input']!r})") from error
+        raise InputError(describe_validation(error, str(path))) from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path}: cannot be read as a tool ({error})") from error
     return tool
