@@ -12,7 +12,7 @@ from pipeline.field import Fixture, ForceField
 from pipeline.field.certificate import rate_bound_n_per_mm
 from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
 from pipeline.field.spline import space_coefficients
-from pipeline.field.stiffness import field_rates_n_per_m, law_rates_n_per_m
+from pipeline.field.stiffness import field_rates_n_per_m
 from pipeline.field.store import FieldWriter
 from pipeline.geometry import Float, Grid
 
@@ -49,6 +49,19 @@ def curvature_of_ring(points_mm: Float) -> Float:
     about = np.hypot(points_mm[:, 0], points_mm[:, 1])
     tube = np.hypot(about - MAJOR_MM, points_mm[:, 2])
     return np.column_stack([1 / tube, (about - MAJOR_MM) / tube / about])
+
+
+def law_rates_n_per_m(fixture: Fixture, q_mm: Float, curvature_per_mm: Float) -> Float:
+    """Along the force, then across it, of the law on a perfect distance, ``(n, 3)``.
+
+    The formula of `pipeline.field.stiffness`; curvatures of the level surface of q are positive
+    where it bulges towards larger q. Positive holds, negative drives apart.
+    """
+    delta_mm, m, most_n = fixture.resolved_delta_mm, fixture.m, fixture.f_max_n
+    power = (q_mm**2 / (2 * delta_mm**2)) ** m
+    slope = 2 * m / q_mm * power * np.exp(-power)
+    across = -np.expm1(-power)[:, None] * curvature_per_mm
+    return 1000 * most_n * np.column_stack([slope, across])
 
 
 SHAPES = {

@@ -1,4 +1,4 @@
-"""How fast a fixture's force changes with place: by its law, and as a field gives it.
+"""How fast a fixture's force changes with place, as a field gives it, and why.
 
 With q the depth, n its direction of rise and H the Hessian of q, the force ``-f_max f(q) n`` has
 the derivative ``-f_max (f'(q) n n^T + f(q) H)``. One of H's own values is 0, along n; the others
@@ -17,38 +17,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.field.fixture import Fixture
-from pipeline.field.potential import potential
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float
 
 STEP_MM = 0.1
 """Over which a field's force is compared, centred on the place."""
-
-
-def law_rates_n_per_m(fixture: Fixture, q_mm: Float, curvature_per_mm: Float) -> Float:
-    """Rates of a fixture's law, by the formula above.
-
-    Parameters
-    ----------
-    fixture
-        Its potential and largest force.
-    q_mm
-        ``(n,)`` depths, positive.
-    curvature_per_mm
-        ``(n, 2)`` principal curvatures of the level surface of q at each place: positive where it
-        bulges towards larger q, negative where it is hollow there.
-
-    Returns
-    -------
-    ``(n, 3)``: along the force, then across it, N/m. Positive holds, as a spring does; negative
-    drives apart.
-    """
-    delta_mm, m, most_n = fixture.resolved_delta_mm, fixture.m, fixture.f_max_n
-    power = (q_mm**2 / (2 * delta_mm**2)) ** m
-    slope = 2 * m / q_mm * power * np.exp(-power)
-    across = potential(q_mm, delta_mm, m)[:, None] * curvature_per_mm
-    return 1000 * most_n * np.column_stack([slope, across])
 
 
 def field_rates_n_per_m(field: ForceField, points_mm: Float, phases: Float, name: str) -> Float:
@@ -67,8 +40,8 @@ def field_rates_n_per_m(field: ForceField, points_mm: Float, phases: Float, name
 
     Returns
     -------
-    ``(n, 3)`` rising, N/m, signs as in ``law_rates_n_per_m``: own values of the symmetric part of
-    the derivative, taken by central differences.
+    ``(n, 3)`` rising, N/m, own values of the symmetric part of the derivative, taken by central
+    differences: positive holds, as a spring does; negative drives apart.
     """
     derivative = np.empty((len(points_mm), 3, 3))
     for axis, step_mm in enumerate(STEP_MM / 2 * np.eye(3)):
