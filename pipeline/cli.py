@@ -19,6 +19,7 @@ from cyclopts import App, CycloptsError, Parameter
 from pipeline import __version__
 from pipeline.errors import BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
+from pipeline.summary import summary
 
 HELP = "From a patient's cine MR to a force field that a haptic robot can feel."
 
@@ -81,6 +82,16 @@ def _stage_name(name: str | None) -> str | None:
     return name
 
 
+def _require_order(first: str | None, last: str | None) -> None:
+    from pipeline.run import STAGE_NAMES
+
+    if first and last and STAGE_NAMES.index(first) > STAGE_NAMES.index(last):
+        raise InputError(
+            f"--from {first} comes after --until {last}: no stage would be run again; the stages "
+            f"are, in order, {', '.join(STAGE_NAMES)}"
+        )
+
+
 @app.command
 def run(
     study: Path,
@@ -104,44 +115,16 @@ def run(
         End after this stage.
     """
     first, last = _stage_name(from_), _stage_name(until)
+    _require_order(first, last)
     record = _run(study, out, config, first, last)
-    print(_summary(record, out / record["patient_id"]))
+    print(summary(record, out / record["patient_id"]))
     return 0
-
-
-def _summary(record: dict[str, Any], products: Path) -> str:
-    lines = [
-        f"{name:9s} {stage['status']:8s}"
-        + (f" {stage['seconds']:7.1f} s {stage['peak_memory_mb']:6d} MB" if _timed(stage) else "")
-        + (f" {stage['cause']}" if "cause" in stage else "")
-        for name, stage in record["stages"].items()
-    ]
-    seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
-    lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
-    bake = record["stages"].get("bake", {})
-    example = bake.get("figures", {}).get("example")
-    if example and bake["status"] != "stale":
-        point = " ".join(f"{value:g}" for value in example["point_mm"])
-        field = products / "bake" / "field.zarr"
-        lines.append(
-            f"query     beatfield query {field} --point {point} --phase {example['phase']}"
-        )
-    page = products / "report" / "index.html"
-    lines.append(f"products  {products}")
-    if page.exists():
-        stale = record["stages"].get("report", {}).get("status") == "stale"
-        lines.append(f"report    {page}" + (" (stale: `beatfield run` renews it)" if stale else ""))
-    return "\n".join(lines)
-
-
-def _timed(stage: dict[str, Any]) -> bool:
-    return stage.get("seconds") is not None
 
 
 def _stage_command(name: str, help_text: str) -> None:
     def command(study: Path, /, *, out: Out, config: Config = None) -> int:
         record = _run(study, out, config, last=name)
-        print(_summary(record, out / record["patient_id"]))
+        print(summary(record, out / record["patient_id"]))
         return 0
 
     command.__doc__ = help_text + ", bringing the stages before it up to date."
@@ -182,7 +165,7 @@ def bake(
         raise InputError("bake needs either a STUDY or --surfaces FOLDER")
     if study is not None:
         record = _run(study, out, config, last="bake")
-        print(_summary(record, out / record["patient_id"]))
+        print(summary(record, out / record["patient_id"]))
         return 0
     assert surfaces is not None
     from pipeline.config import read_settings
@@ -206,9 +189,12 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
         How many studies to run at a time.
     """
     from pipeline.batch import NO_STUDY, run_batch, table
+    from pipeline.config import read_settings
 
     if workers < 1:
         raise InputError(f"--workers {workers}: at least 1 is needed")
+    # What is wrong with the settings is wrong for every study, and is said once.
+    read_settings(config)
 
     def ended(name: str, status: str, seconds: float) -> None:
         print(f"{name:24s} {status} in {seconds:.1f} s", file=sys.stderr, flush=True)

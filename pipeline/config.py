@@ -6,7 +6,6 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Self
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import InputError
@@ -15,6 +14,7 @@ from pipeline.imaging.settings import SegmentSettings
 from pipeline.registration.settings import RegisterSettings
 from pipeline.study import describe_validation
 from pipeline.surface.settings import SurfaceSettings
+from pipeline.yaml_files import read_yaml
 
 
 class Settings(BaseModel):
@@ -63,14 +63,15 @@ def _settings(path: Path) -> Settings:
         raise InputError(
             f"{path}: no such file; copy configs/default.yaml and keep what you change"
         )
-    try:
-        content = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({error})") from error
+    content = read_yaml(path)
+    if content is None:
+        return Settings()
     if not isinstance(content, dict):
         raise InputError(f"{path}: needs sections such as `bake:`, got {content!r}")
+    # Where all keys of a section are commented out, all of them are the default.
+    sections = {name: {} if value is None else value for name, value in content.items()}
     try:
-        return Settings.model_validate(content)
+        return Settings.model_validate(sections)
     except ValidationError as error:
         raise InputError(describe_validation(error, str(path), Settings)) from error
 

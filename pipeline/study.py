@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
-import yaml
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import InputError
+from pipeline.geometry import require_rigid
+from pipeline.yaml_files import read_yaml
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 DICOM_ENDINGS = (".dcm", ".ima", "")
+WFDB_ENDINGS = (".hea", ".dat")
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
 class _Section(BaseModel):
@@ -46,17 +51,22 @@ class UltrasoundFiles(_Section):
     """Tracked sweeps, and the first guess of where the tracker stands."""
 
     sweeps: tuple[Path, ...] = Field(min_length=1)
-    initial_mr_from_tracker: list[list[float]] | None = None
+    initial_mr_from_tracker: list[Row] | None = Field(None, min_length=4, max_length=4)
 
 
-class Study(_Section):
-    """One patient's files; paths are absolute."""
+class Described(_Section):
+    """What ``study.yaml`` may say."""
 
     patient_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    folder: Path
     cine: CineFiles
     ecg: EcgFiles = EcgFiles()
     us: UltrasoundFiles | None = None
+
+
+class Study(Described):
+    """One patient's files; paths are absolute."""
+
+    folder: Path
 
     @property
     def long_axis(self) -> Path:
@@ -100,6 +110,7 @@ def open_study(folder: Path) -> Study:
             raise InputError(_no_study_message(folder, inside))
         folder = inside[0]
     folder = folder.resolve()
+    _require_name_of_description(folder)
     described = folder / "study.yaml"
     given = _read_yaml(described) if described.exists() else {}
     study = _understood(folder, given, str(described if given else folder))
@@ -116,6 +127,12 @@ def _is_study(folder: Path) -> bool:
     return (folder / "study.yaml").is_file() or (folder / "cine").is_dir()
 
 
+def _require_name_of_description(folder: Path) -> None:
+    for path in folder.iterdir():
+        if path.name.lower() in ("study.yml", "study.yaml") and path.name != "study.yaml":
+            raise InputError(f"{path}: would not be read; rename it to study.yaml")
+
+
 def _no_study_message(folder: Path, inside: list[Path]) -> str:
     if inside:
         return (
@@ -126,10 +143,10 @@ def _no_study_message(folder: Path, inside: list[Path]) -> str:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({error})") from error
+    content = read_yaml(path)
+    # All that is left out is what the folders hold, and an empty file leaves out everything.
+    if content is None:
+        return {}
     if not isinstance(content, dict):
         raise InputError(f"{path}: needs keys and values, such as `patient_id: NAME`")
     return content
@@ -137,14 +154,19 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
     """What the folders hold, each key that is given in its place."""
-    content = {"patient_id": folder.name, **given, "folder": folder}
+    content = {"patient_id": folder.name, **given}
     for name, found in (("ecg", _found_ecg(folder)), ("us", _found_us(folder))):
         content[name] = _overridden(found, given[name]) if name in given else found
+    if content["ecg"] is None:
+        content["ecg"] = {}
+    if "us" not in given and content["us"] is None:
+        _require_nothing_in(folder / "us")
     content["cine"] = _found_cine(folder, given.get("cine", {}))
     try:
-        return _absolute(Study.model_validate(content))
+        described = Described.model_validate(content)
     except ValidationError as error:
-        raise InputError(describe_validation(error, where, Study)) from error
+        raise InputError(describe_validation(error, where, Described)) from error
+    return _absolute(Study(folder=folder, **dict(described)))
 
 
 def _overridden(found: dict[str, Any] | None, given: Any) -> Any:
@@ -156,41 +178,68 @@ def describe_validation(
 ) -> str:
     """A validation error as lines that name the file, the key, and what came.
 
-    With the ``model`` that was to be filled, an unknown key is answered with the nearest known.
+    With the ``model`` that was to be filled, an unknown key is answered with the nearest known, and
+    with the sections that have a key of this name.
     """
     lines = []
     for one in error.errors():
         key = ".".join(str(part) for part in one["loc"]) or "(all)"
         message = one["msg"].removeprefix("Value error, ")
         if one["type"] == "extra_forbidden":
-            message = f"unknown key{_instead(one['loc'], model)}"
+            message = f"unknown key; {_instead(one['loc'], model)}"
+        elif one["type"] == "model_type" and (below := _keys(_at(one["loc"], model))):
+            message = f"needs keys below it ({', '.join(below)})"
+        elif one["type"] == "string_type" and isinstance(one["input"], int | float):
+            message = "needs text; put it in quotes"
         came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
         lines.append(f"{where}: {key}: {message}{came}")
     return "\n".join(lines)
 
 
 def _instead(place: tuple[int | str, ...], model: type[BaseModel] | None) -> str:
-    known: Any = model
-    for part in place[:-1]:
-        known = _within(known, part)
-    names = _keys(known) if isinstance(known, type) and issubclass(known, BaseModel) else {}
-    near = get_close_matches(str(place[-1]), names, 1)
-    return f"; did you mean {near[0]}?" if near else "; check its spelling"
+    """What to do about an unknown key."""
+    key = str(place[-1])
+    homes = " or ".join(_homes(key, model))
+    # A name that is known elsewhere is hardly misspelt: only a close likeness is then named too.
+    near = get_close_matches(key, _keys(_at(place[:-1], model)), 1, 0.7 if homes else 0.6)
+    said = [f"it belongs {homes}"] if homes else []
+    said += [f"did you mean {near[0]}?"] if near else []
+    return ", or ".join(said) or "check its spelling"
 
 
-def _keys(model: type[BaseModel]) -> dict[str, Any]:
+def _homes(key: str, model: Any, section: str = "") -> list[str]:
+    """Where a model and those within it have such a key."""
+    known = _keys(model)
+    homes = [f"under {section}" if section else "at the top level"] if key in known else []
+    for name in known:
+        inner, place = _within(model, name), f"{section}.{name}" if section else name
+        if get_origin(inner) is dict:
+            inner, place = _within(inner, "NAME"), f"{place}.NAME"
+        homes += _homes(key, inner, place)
+    return homes
+
+
+def _keys(model: Any) -> dict[str, Any]:
     """Annotations of a model's fields, by the keys under which they are given."""
+    if not (isinstance(model, type) and issubclass(model, BaseModel)):
+        return {}
     return {one.alias or name: one.annotation for name, one in model.model_fields.items()}
+
+
+def _at(place: tuple[int | str, ...], model: Any) -> Any:
+    """The model at a place within a model, or None."""
+    for part in place:
+        model = _within(model, part)
+    return model
 
 
 def _within(known: Any, key: int | str) -> Any:
     """The model under one key of a model or of a mapping, or None."""
-    if isinstance(known, type) and issubclass(known, BaseModel):
-        known = _keys(known).get(str(key))
-        models = [one for one in get_args(known) if isinstance(one, type)]
-        is_optional = type(None) in models
-        return models[0] if is_optional else known
-    return get_args(known)[1] if get_origin(known) is dict else None
+    if get_origin(known) is dict:
+        return get_args(known)[1]
+    inner = _keys(known).get(str(key))
+    kinds = [one for one in get_args(inner) if isinstance(one, type)]
+    return kinds[0] if type(None) in kinds else inner
 
 
 def _absolute(study: Study) -> Study:
@@ -220,8 +269,9 @@ def _found_cine(folder: Path, given: Any) -> Any:
     images = [one for one in _files(cine) if one.name.endswith(NIFTI_ENDINGS)]
     if len(images) > 1:
         raise InputError(
-            f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}); "
-            "one 4D file is needed, or study.yaml that names it under cine.path"
+            f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}), one 4D "
+            "file is needed: name it under cine.path in study.yaml, or, where each file is one "
+            "phase, join them into one and write timing.json beside it, as docs/study.md shows"
         )
     if images and cine.is_dir():
         _require_no_dicom(cine, images[0])
@@ -249,6 +299,17 @@ def _found_us(folder: Path) -> dict[str, Any] | None:
     return {"sweeps": sweeps} if sweeps else None
 
 
+def _require_nothing_in(us: Path) -> None:
+    """Refuse files that a user took for sweeps, and that nothing would read."""
+    others = [one for one in _files(us) if not one.name.startswith(".")]
+    if others:
+        raise InputError(
+            f"{us}: holds no sweep but {others[0].name}; sweeps are .mha or .mhd files directly in "
+            "this folder: convert or move them, name them under us.sweeps in study.yaml, or write "
+            "`us: null` there"
+        )
+
+
 def _record(stem: Path) -> Path | None:
     if stem.with_suffix(".hea").exists():
         return stem
@@ -258,6 +319,8 @@ def _record(stem: Path) -> Path | None:
 
 
 def _record_files(stem: Path | None) -> list[Path]:
+    if stem is not None and stem.suffix in WFDB_ENDINGS:
+        stem = stem.with_suffix("")
     return [] if stem is None else sorted(stem.parent.glob(stem.name + "*"))
 
 
@@ -275,6 +338,7 @@ def _require_files(study: Study) -> None:
         raise InputError(
             f"{study.cine.path}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file"
         )
+    _require_what_fits_the_cine(study)
     for stem in (study.ecg.mr, study.ecg.us):
         if stem is not None and not _record_files(stem):
             raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
@@ -282,6 +346,34 @@ def _require_files(study: Study) -> None:
         raise InputError(
             f"{study.folder}: has tracked ultrasound but no ECG recorded with it; add ecg/us.hea "
             "with its data, or take us/ out"
+        )
+    if study.us and study.us.initial_mr_from_tracker:
+        start = np.array(study.us.initial_mr_from_tracker, dtype=float)
+        require_rigid(start, f"{study.folder}/study.yaml: us.initial_mr_from_tracker")
+
+
+def _require_what_fits_the_cine(study: Study) -> None:
+    """Refuse what is meant for DICOM files beside NIfTI, and the reverse: it would do nothing."""
+    cine, described = study.cine, study.folder / "study.yaml"
+    if cine.path.is_file() and not cine.path.name.endswith(NIFTI_ENDINGS):
+        raise InputError(
+            f"{described}: cine.path: {cine.path} is no NIfTI file (.nii, .nii.gz); of DICOM "
+            "files, even of a single one, name the folder"
+        )
+    if cine.path.is_file() and cine.fill_gaps:
+        raise InputError(
+            f"{described}: cine.fill_gaps: applies to DICOM only, and {cine.path} is NIfTI; take "
+            "the key out, and if slices are missing from the file, fill them in it"
+        )
+    if cine.path.is_dir() and cine.timing:
+        raise InputError(
+            f"{described}: cine.timing: applies to NIfTI only, and {cine.path} is a folder of "
+            "DICOM files, which tell their own times; take the key out, or give cine.rr_ms"
+        )
+    if cine.path.is_dir() and _files(study.long_axis):
+        raise InputError(
+            f"{study.long_axis}: is read beside a NIfTI cine only, and {cine.path} is a folder of "
+            "DICOM files; put DICOM files of the views there, or take this folder out"
         )
 
 

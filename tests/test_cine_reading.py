@@ -199,6 +199,14 @@ def test_a_slice_with_phases_of_its_own_is_refused(tmp_path: Path) -> None:
         read_nifti_cine(tmp_path / "cine.nii", timing)
 
 
+def test_a_file_of_one_phase_is_answered_with_what_to_do(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4), np.int16), np.diag([1, 1, 8, 1.0]))
+    nibabel.save(image, tmp_path / "ed.nii.gz")
+    words = r"ed\.nii\.gz: is not a cine, its shape is \(8, 6, 4\).*join them into one 4D file"
+    with pytest.raises(InputError, match=words):
+        read_nifti_cine(tmp_path / "ed.nii.gz", None)
+
+
 def test_a_sheared_affine_is_refused(tmp_path: Path) -> None:
     affine = np.diag([1.5, 1.5, 10, 1.0])
     affine[0, 1] = 0.2
@@ -256,6 +264,17 @@ def test_a_given_rr_interval_is_that_of_untimed_long_axis_views_too(
     np.testing.assert_allclose(untimed.phases, [0, 0.25, 0.5, 0.75])
     assert untimed.rr_s == pytest.approx(0.8)
     np.testing.assert_allclose(timed.phases, [0, 0.2, 0.5, 0.9])
+
+
+@pytest.mark.parametrize("name", ["four_chamber.json", "2ch_timing.json", "IM0001"])
+def test_what_is_no_long_axis_view_nor_its_timing_is_named(tmp_path: Path, name: str) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 1, 4), np.int16), np.diag([1, 1, 8, 1.0]))
+    nibabel.save(image, tmp_path / "four_chamber.nii.gz")
+    (tmp_path / ".DS_Store").touch()
+    assert len(read_nifti_views(tmp_path, rr_ms=800)) == 1
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match=rf"{name}: would not be read"):
+        read_nifti_views(tmp_path, rr_ms=800)
 
 
 def test_a_truncated_nifti_file_is_named(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import _summary, main
+from pipeline.cli import main
+from pipeline.summary import summary
 
 
 @pytest.mark.parametrize(
@@ -24,6 +25,11 @@ from pipeline.cli import _summary, main
         (["batch", "none", "--out", "o"], "none: no such folder"),
         (["batch", ".", "--out", "o", "--workers", "0"], "at least 1 is needed"),
         (["batch", ".", "--out", "o"], "holds no study"),
+        (["batch", ".", "--out", "o", "--config", "none.yaml"], "none.yaml: no such file"),
+        (
+            ["run", "p", "--out", "o", "--from", "bake", "--until", "surface"],
+            "--from bake comes after --until surface",
+        ),
     ],
 )
 def test_wrong_input_ends_with_exit_code_2_and_says_what_is_wrong(
@@ -55,6 +61,17 @@ def test_a_wrong_command_ends_with_exit_code_2(
     ("yaml", "words"),
     [
         ("bkae: {spacing_mm: 1}", "bkae: unknown key; did you mean bake?"),
+        ("spacing_mm: 1", "spacing_mm: unknown key; it belongs under bake"),
+        ("bake: {grid_mm: 2}", "bake.grid_mm: unknown key; it belongs under segment"),
+        ("bake: {sign_errors: 1}", "sign_errors: unknown key; it belongs under bake.bounds"),
+        ("surface: {margin_mm: 1}", "it belongs under segment or under bake"),
+        ("bake: {structure: aorta}", "under fixtures.NAME, or did you mean structures?"),
+        ("bake: {register: {seed: 1}}", "bake.register: unknown key; it belongs at the top level"),
+        ("bake: {samples: 200}\nbake: {spacing_mm: 2}", "line 2: bake is given a second time"),
+        ("bake: 3", "bake: needs keys below it (spacing_mm, "),
+        ("bkae:", "bkae: unknown key; did you mean bake?"),
+        ("fixtures:", "at least one fixture is needed; leave the key out"),
+        ("[]", "needs sections"),
         ("bake: {spcing_mm: 1}", "bake.spcing_mm: unknown key; did you mean spacing_mm?"),
         ("regster: {seed: 1}", "regster: unknown key; did you mean register?"),
         ("bake: {bounds: {sing_errors: 1}}", "did you mean sign_errors?"),
@@ -96,6 +113,14 @@ def test_a_wrong_config_is_refused_with_file_and_key(
     said = capsys.readouterr().err
     assert "mine.yaml" in said
     assert words in said
+
+
+@pytest.mark.parametrize("text", ["", "# bake:\n", "bake:\n# spacing_mm: 2\nregister:\n"])
+def test_what_is_left_empty_is_the_default(text: str, tmp_path: Path) -> None:
+    from pipeline.config import Settings, read_settings
+
+    (tmp_path / "mine.yaml").write_text(text)
+    assert read_settings(tmp_path / "mine.yaml") == Settings()
 
 
 def test_a_configuration_that_is_not_there_is_named(
@@ -170,6 +195,38 @@ def test_stale_products_are_not_offered_as_if_they_were_current(tmp_path, state)
     example = {"point_mm": [1.0, 2.0, 3.0], "phase": 0.5}
     stage = {"status": state, "figures": {"example": example}}
     record = {"status": "done", "stages": {"bake": stage, "report": {"status": state}}}
-    said = _summary(record, tmp_path)
+    said = summary(record, tmp_path)
     assert ("beatfield query" in said) == (state == "done")
     assert ("stale: " in said) == (state == "stale")
+
+
+@pytest.mark.parametrize(
+    ("verdict", "reason", "calibration", "line"),
+    [
+        ("good", "", "", "good, expected error over the heart 1.5 mm"),
+        (
+            "doubtful",
+            "30 of 80 frames bear the pose out",
+            "",
+            "doubtful, expected error over the heart 1.5 mm, "
+            "because: 30 of 80 frames bear the pose out",
+        ),
+        (
+            "good",
+            "",
+            "calibration of left corrected by 0.2 ± 0.9 mm and 0.1 ± 0.8 degrees",
+            "good, expected error over the heart 1.5 mm, widened by calibration: per_sweep",
+        ),
+    ],
+)
+def test_the_summary_says_what_the_registration_is_worth(
+    tmp_path: Path, verdict: str, reason: str, calibration: str, line: str
+) -> None:
+    figures = {"verdict": verdict, "reason": reason, "expected_tre_mm": 1.541}
+    stage = {"status": "done", "figures": {**figures, "calibration": calibration}}
+    record = {"status": "done", "stages": {"register": stage}}
+    assert f"verdict   registration {line}" in summary(record, tmp_path).splitlines()
+    stage["status"] = "stale"
+    assert "verdict" not in summary(record, tmp_path)
+    stage.update(status="skipped", cause="no tracked ultrasound", figures={})
+    assert "verdict" not in summary(record, tmp_path)

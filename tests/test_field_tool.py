@@ -1,5 +1,7 @@
 """Tools of any shape: read, divided, and felt like a plain sum over their points."""
 
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +113,12 @@ def test_samples_spread_evenly_over_area():
         ("shape: needle\nlength_mm: -3\n", "length_mm"),
         ("shape: needle\nlength_mm: 3\ncolour: red\n", "colour"),
         ("shape: [\n", "cannot be read"),
+        (
+            "shape: needle\nlength_mm: 3\nlength_mm: 30\n",
+            "line 3: length_mm is given a second time",
+        ),
+        ("shape: mesh\npath: 7\n", r"mesh\.path: "),
+        ("", r"t\.yaml: \(all\)"),
         ("shape: polyline\npoints_mm: []\n", "points_mm"),
     ],
 )
@@ -128,9 +136,44 @@ def test_wrong_questions_about_tools_are_refused(field, tmp_path):
         field.tool_force(tool, np.eye(4), 0.1, bound_n=0)
     with pytest.raises(InputError, match="no fixture"):
         field.tool_force(tool, np.eye(4), 0.1, "none")
-    (tmp_path / "t.yaml").write_text("shape: mesh\npath: none.stl\n")
-    with pytest.raises(InputError, match=r"none\.stl"):
-        read_tool(tmp_path / "t.yaml").lines_mm()
+
+
+def wrong_meshes(folder: Path) -> None:
+    """Files of which none is a mesh with triangles."""
+    ball = pyvista.Icosphere(radius=2.0, nsub=2)
+    for name in ("cut.stl", "cut.vtp"):
+        ball.save(folder / name)
+        (folder / name).write_bytes((folder / name).read_bytes()[:-2020])
+    for name in ("text.stl", "text.obj", "text.txt"):
+        (folder / name).write_text("no mesh\n")
+    (folder / "folder.stl").mkdir()
+    pyvista.Line().save(folder / "line.vtp")
+    pyvista.PolyData(np.zeros((3, 3)), [3, 0, 1, 2]).save(folder / "flat.ply")
+
+
+@pytest.mark.parametrize("strict", [True, False])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("none.stl", "no such mesh"),
+        ("folder.stl", "no such mesh"),
+        ("cut.stl", "cannot be read as a tool's mesh"),
+        ("cut.vtp", "cannot be read as a tool's mesh"),
+        ("text.stl", "cannot be read as a tool's mesh"),
+        ("text.obj", "holds no triangles"),
+        ("text.txt", "cannot be read as a tool's mesh"),
+        ("line.vtp", "holds no triangles"),
+        ("flat.ply", "has no area"),
+    ],
+)
+def test_a_wrong_mesh_is_noticed_with_its_tool(tmp_path, name, words, strict):
+    """Whether the readers' warnings are errors, as in these tests, or not, as elsewhere."""
+    wrong_meshes(tmp_path)
+    (tmp_path / "t.yaml").write_text(f"shape: mesh\npath: {name}\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error" if strict else "ignore")
+        with pytest.raises(InputError, match=rf"t\.yaml: path: .*{re.escape(name)}: {words}"):
+            read_tool(tmp_path / "t.yaml")
 
 
 def test_a_wrong_key_is_named_beside_the_missing_one(tmp_path):

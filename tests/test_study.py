@@ -107,6 +107,50 @@ def test_null_takes_out_what_the_folders_hold(tmp_path: Path) -> None:
     assert study.ecg.mr is None
 
 
+@pytest.mark.parametrize("text", ["", "# patient_id: robot-01\n"])
+def test_an_empty_study_yaml_changes_nothing(tmp_path: Path, text: str) -> None:
+    folder = study_folder(tmp_path)
+    found = open_study(folder)
+    (folder / "study.yaml").write_text(text)
+    assert open_study(folder) == found
+
+
+@pytest.mark.parametrize("name", ["study.yml", "Study.yaml"])
+def test_a_description_under_another_name_is_not_overlooked(tmp_path: Path, name: str) -> None:
+    folder = study_folder(tmp_path)
+    (folder / name).write_text("patient_id: robot-01\n")
+    with pytest.raises(InputError, match=rf"{name}: would not be read; rename it to study\.yaml"):
+        open_study(folder)
+
+
+def test_a_study_may_have_no_ecg_at_all(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "study.yaml").write_text("us: null\necg: null\n")
+    assert open_study(folder).ecg == EcgFiles()
+
+
+@pytest.mark.parametrize("ending", ["", ".hea", ".dat"])
+def test_a_wfdb_record_is_all_its_files_however_it_is_named(tmp_path: Path, ending: str) -> None:
+    """Or else a change of the signal would leave products standing that were made of another."""
+    folder = study_folder(tmp_path)
+    (folder / "study.yaml").write_text(f"ecg: {{mr: ecg/mr{ending}}}\n")
+    files = open_study(folder).input_files()["mr_ecg"]
+    assert [path.name for path in files] == ["mr.dat", "mr.hea"]
+
+
+@pytest.mark.parametrize("name", ["us/sweep.nrrd", "us/left/sweep.mha", "us/sweep.MHA"])
+def test_ultrasound_that_is_not_found_is_not_taken_for_none(tmp_path: Path, name: str) -> None:
+    folder = study_folder(tmp_path, us=False)
+    (folder / name).parent.mkdir(parents=True)
+    (folder / "us" / ".DS_Store").touch()
+    assert open_study(folder).us is None
+    (folder / name).touch()
+    with pytest.raises(InputError, match=rf"us: holds no sweep but {Path(name).name}"):
+        open_study(folder)
+    (folder / "study.yaml").write_text("us: null\n")
+    assert open_study(folder).us is None
+
+
 @pytest.mark.parametrize("path", [None, "cine", "cine/cine.nii.gz"])
 def test_a_nifti_cine_has_its_timing_however_it_is_named(tmp_path: Path, path: str | None) -> None:
     cine = tmp_path / "p" / "cine"
@@ -126,7 +170,7 @@ def test_of_two_nifti_files_study_yaml_names_one(tmp_path: Path) -> None:
     cine.mkdir(parents=True)
     for name in ("a.nii.gz", "b.nii.gz"):
         (cine / name).touch()
-    with pytest.raises(InputError, match="holds 2 NIfTI files"):
+    with pytest.raises(InputError, match=r"holds 2 NIfTI files .* join them into one and write"):
         open_study(tmp_path / "p")
     (tmp_path / "p" / "study.yaml").write_text("cine: {path: cine/b.nii.gz}\n")
     assert open_study(tmp_path / "p").cine.path == cine / "b.nii.gz"
@@ -147,6 +191,28 @@ def test_a_nifti_file_among_dicom_files_does_not_hide_them(tmp_path: Path, name:
     assert open_study(tmp_path / "p").cine.path == cine / "x.nii.gz"
 
 
+def test_gaps_of_a_nifti_cine_are_not_silently_left_open(tmp_path: Path) -> None:
+    cine = tmp_path / "p" / "cine"
+    cine.mkdir(parents=True)
+    (cine / "x.nii").touch()
+    (tmp_path / "p" / "study.yaml").write_text("cine: {fill_gaps: true}\n")
+    with pytest.raises(
+        InputError, match=r"cine\.fill_gaps: applies to DICOM only.*x\.nii is NIfTI"
+    ):
+        open_study(tmp_path / "p")
+    (tmp_path / "p" / "study.yaml").write_text("cine: {fill_gaps: false}\n")
+    assert open_study(tmp_path / "p").cine.path == cine / "x.nii"
+
+
+def test_long_axis_views_beside_dicom_files_are_not_overlooked(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "long_axis").mkdir()
+    assert open_study(folder).cine.path == folder / "cine"
+    (folder / "long_axis" / "four_chamber.nii.gz").touch()
+    with pytest.raises(InputError, match="long_axis: is read beside a NIfTI cine only"):
+        open_study(folder)
+
+
 def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None:
     study_folder(tmp_path).rename(tmp_path / "patient 7")
     with pytest.raises(InputError, match=r"patient_id: .*'patient 7'"):
@@ -159,6 +225,24 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("cien: {path: cine}", r"cien: unknown key; did you mean cine\?"),
         ("us: {sweps: [us/sweep_000.mha]}", r"us.sweps: unknown key; did you mean sweeps\?"),
         ("qwerty: 1", "qwerty: unknown key; check its spelling"),
+        ("rr_ms: 800", "rr_ms: unknown key; it belongs under cine"),
+        ("us: {fill_gaps: true}", "us.fill_gaps: unknown key; it belongs under cine"),
+        ("cine: {us: lab}", "cine.us: unknown key; it belongs at the top level or under ecg"),
+        ("folder: cine", "folder: unknown key; check its spelling"),
+        ("patient_id: 7", r"patient_id: needs text; put it in quotes \(got 7\)"),
+        ("cine: mr", r"cine: needs keys below it \(path, timing, rr_ms, fill_gaps\) \(got 'mr'\)"),
+        (
+            "cine: {}\necg: {}\ncine: {rr_ms: 9}",
+            "line 3: cine is given a second time, after line 1",
+        ),
+        ("cine: {rr_ms: 800,\n rr_ms: 900}", "line 2: rr_ms is given a second time, after line 1"),
+        ("cine: {timing: ecg/us.dat}", "cine.timing: applies to NIfTI only"),
+        ("cine: {path: cine/a.dcm}", "of DICOM files, even of a single one, name the folder"),
+        ("us: {initial_mr_from_tracker: [[1, 0], [0]]}", "us.initial_mr_from_tracker"),
+        (
+            "us: {initial_mr_from_tracker: [[2,0,0,0], [0,1,0,0], [0,0,1,0], [0,0,0,1]]}",
+            r"us\.initial_mr_from_tracker: is not a rotation and a shift",
+        ),
         ("cine: {path: nowhere}", "nowhere does not exist"),
         ("ecg: {us: ecg/lost}", "no ECG record"),
         ("us: {sweeps: [us/sweep_009.mha]}", "does not exist"),
@@ -227,6 +311,27 @@ def test_the_pages_timing_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "timing.json").write_text(timing)
     stack = read_nifti_cine(tmp_path / "cine.nii.gz", tmp_path / "timing.json")
     np.testing.assert_allclose(stack.cine.phases, [0, 0.25, 0.5, 0.75])
+
+
+def test_the_pages_way_to_join_phases_makes_a_cine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipeline.imaging.nifti import read_nifti_cine
+
+    (example,) = shown("python")
+    place = np.diag([1.5, 1.25, 9, 1])
+    for value, name in enumerate(re.findall(r'"(\w+\.nii\.gz)"', example)[:2]):
+        image = nibabel.Nifti1Image(np.full((5, 6, 3), value, np.int16), place)
+        nibabel.save(image, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    (timing,) = re.findall(r"{.*}", example)
+    (tmp_path / "timing.json").write_text(timing)
+    cine = read_nifti_cine(tmp_path / "cine.nii.gz", tmp_path / "timing.json").cine
+    np.testing.assert_allclose(cine.phases, [0, 320 / 900])
+    assert cine.intensity.shape == (2, 3, 6, 5)
+    assert [set(phase.ravel()) for phase in cine.intensity] == [{0}, {1}]
+    np.testing.assert_allclose(np.abs(cine.mr_from_index), place, atol=1e-6)
 
 
 def test_the_pages_ecg_is_read(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ tool's own frame (mm): z along the shaft or axis, the tip (or the middle of a ri
 from __future__ import annotations
 
 import math
+import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -122,27 +123,43 @@ class Mesh(_Tool):
         Raises
         ------
         InputError
-            When the file is no triangle mesh.
+            When there is no such file, or it is no triangle mesh.
         """
-        import pyvista
-
-        try:
-            mesh = pyvista.read(self.path).extract_surface(algorithm=None).triangulate()
-            corners = np.asarray(mesh.points, float)[mesh.regular_faces]
-        except (OSError, ValueError, AttributeError) as error:
-            raise InputError(f"{self.path}: cannot be read as a tool's mesh ({error})") from error
-        return [point[None] for point in spread_points(corners, self.samples)]
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: no such mesh; give a VTP, STL, PLY or OBJ file")
+        corners_mm = _corners_mm(self.path)
+        if not len(corners_mm):
+            raise InputError(f"{self.path}: holds no triangles; a tool's mesh is made of them")
+        return [point[None] for point in spread_points(corners_mm, self.samples, str(self.path))]
 
 
 Tool = Annotated[Needle | Cylinder | Torus | Polyline | Mesh, Field(discriminator="shape")]
 
 
-def spread_points(corners_mm: Float, count: int) -> Float:
+def _corners_mm(path: Path) -> Float:
+    """``(n, 3, 3)`` corners of a mesh file's triangles."""
+    import pyvista
+
+    try:
+        with warnings.catch_warnings():
+            # Of a damaged file VTK only warns, and goes on with what it has.
+            warnings.simplefilter("error", UserWarning)
+            mesh = pyvista.read(path).extract_surface(algorithm=None).triangulate()
+        return np.asarray(np.asarray(mesh.points, float)[mesh.regular_faces])
+    except Exception as error:  # VTK's readers raise whatever the format's parser raises
+        said = str(error).partition("\n")[0]
+        raise InputError(
+            f"{path}: cannot be read as a tool's mesh ({said}); give a whole VTP, STL, PLY or OBJ "
+            "file"
+        ) from error
+
+
+def spread_points(corners_mm: Float, count: int, where: str = "a tool's mesh") -> Float:
     """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time."""
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     area = np.linalg.norm(across, axis=1)
     if not area.sum() > 0:
-        raise InputError("a tool's mesh has no area; give triangles")
+        raise InputError(f"{where}: has no area; give triangles that have some")
     chosen = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(count) + 0.5) / count)
     # Steps of the plastic number: low-discrepancy places in the unit square, folded to a triangle.
     u = (0.7548776662466927 * np.arange(count)) % 1
@@ -154,25 +171,26 @@ def spread_points(corners_mm: Float, count: int) -> Float:
 
 
 def read_tool(path: Path | str) -> Tool:
-    """Read a tool's YAML file.
+    """Read a tool's YAML file, and the mesh that it may name.
 
     Raises
     ------
     InputError
-        When it cannot be read, or a key or value is wrong.
+        When either cannot be read, or a key or value is wrong.
     """
-    import yaml
-
     from pipeline.study import describe_validation
+    from pipeline.yaml_files import read_yaml
 
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text())
-        if isinstance(content, dict) and "path" in content:
-            content["path"] = path.parent / str(content["path"])
-        tool: Tool = TypeAdapter(Tool).validate_python(content)
+        tool: Tool = TypeAdapter(Tool).validate_python(read_yaml(path))
     except ValidationError as error:
         raise InputError(describe_validation(error, str(path))) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot be read as a tool ({error})") from error
+    if isinstance(tool, Mesh):
+        tool = tool.model_copy(update={"path": path.parent / tool.path})
+    try:
+        # Made here, where a wrong mesh can still be mended, and not in a force server's loop.
+        _ = tool.lines
+    except InputError as error:
+        raise InputError(f"{path}: path: {error}") from error
     return tool

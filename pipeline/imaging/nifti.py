@@ -68,7 +68,11 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
     """
     image = _load(path)
     if len(image.shape) != 4:
-        raise InputError(f"{path}: is not a cine, its shape is {image.shape}; 4D is needed")
+        raise InputError(
+            f"{path}: is not a cine, its shape is {image.shape}; 4D is needed: if this is one of "
+            "several phases, join them into one 4D file and write timing.json beside it, as "
+            "docs/study.md shows"
+        )
     intensity, mr_from_index = read_image(path)
     phase_count, slice_count = intensity.shape[:2]
     if slice_count < MIN_SLICES or phase_count < MIN_PHASES:
@@ -99,14 +103,31 @@ def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis
     Raises
     ------
     InputError
-        When a file is not a readable 4D image of one slice, or has no usable timing.
+        When a file is not a readable 4D image of one slice, or has no usable timing, or is neither
+        a view nor the timing of one.
     """
-    paths = [*folder.glob("*.nii"), *folder.glob("*.nii.gz")] if folder.is_dir() else []
-    return tuple(_read_view(path, rr_ms) for path in sorted(paths))
+    if not folder.is_dir():
+        return ()
+    paths = sorted([*folder.glob("*.nii"), *folder.glob("*.nii.gz")])
+    read = {*paths, *(_view_timing(path) for path in paths)}
+    for path in sorted(folder.iterdir()):
+        if path not in read and not path.name.startswith("."):
+            raise InputError(
+                f"{path}: would not be read: views are NAME.nii.gz, each with NAME_timing.json; "
+                "rename it, or take it out of this folder"
+            )
+    return tuple(_read_view(path, rr_ms) for path in paths)
+
+
+def _view_name(path: Path) -> str:
+    return path.name.removesuffix(".gz").removesuffix(".nii")
+
+
+def _view_timing(path: Path) -> Path:
+    return path.with_name(f"{_view_name(path)}_timing.json")
 
 
 def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
-    name = path.name.removesuffix(".gz").removesuffix(".nii")
     image = _load(path)
     if len(image.shape) != 4 or image.shape[2] != 1 or image.shape[3] < MIN_PHASES:
         raise InputError(
@@ -115,12 +136,14 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
             "out of this folder"
         )
     intensity, mr_from_index = read_image(path)
-    timing = path.with_name(f"{name}_timing.json")
+    timing = _view_timing(path)
     own = timing if timing.exists() else None
     triggers, own_rr_ms, _ = _timing(image, path, own, None if own else rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(own or path))
     pixels = np.ascontiguousarray(intensity, np.float32)
-    return LongAxis(name, Cine(pixels, mr_from_index, phases, float(own_rr_ms[0]) / 1000))
+    return LongAxis(
+        _view_name(path), Cine(pixels, mr_from_index, phases, float(own_rr_ms[0]) / 1000)
+    )
 
 
 def _load(path: Path) -> Any:

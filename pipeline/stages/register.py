@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.geometry import Float, MovingSurface, require_rigid
+from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, read_sweep
 from pipeline.job import Job, Skipped
@@ -57,11 +57,7 @@ def _start(job: Job) -> Float | None:
     """The first guess of where the tracker stands; None where the study gives none."""
     assert job.study.us is not None, "only a study with ultrasound is registered"
     given = job.study.us.initial_mr_from_tracker
-    if given is None:
-        return None
-    start = np.array(given, dtype=float)
-    require_rigid(start, f"{job.study.folder}/study.yaml: us.initial_mr_from_tracker")
-    return start
+    return None if given is None else np.array(given, dtype=float)
 
 
 def _registered(
