@@ -45,7 +45,7 @@ def estimated(recording, surfaces, timing, shift_mm=0.0):
     start = start_off(recording, 3, shift_mm, shift_mm)
     search = prepare_search(timing.phases(), surfaces, start, SETTINGS)
     level = search.fine_level(recording.sweeps)
-    pose = climb(level.score, start, search.pivot)
+    pose = climb(level, start, search.pivot)
     return estimate_offset(level, pose, search.pivot, timing)
 
 
@@ -67,7 +67,7 @@ def test_a_pose_drawn_by_a_wrong_offset_is_put_right(recording, surfaces):
     timing = stamped(recording, 0.15)
     search = prepare_search(timing.phases(), surfaces, recording.mr_from_tracker, SETTINGS)
     level = search.fine_level(recording.sweeps)
-    drawn = climb(level.score, recording.mr_from_tracker, search.pivot)
+    drawn = climb(level, recording.mr_from_tracker, search.pivot)
     found = estimate_offset(level, drawn, search.pivot, timing)
     before, after = (
         search.pivot.distance(pose, recording.mr_from_tracker)

@@ -12,9 +12,12 @@ from ellipsoid_heart import PHASES, moving_surfaces, record, start_off
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
+from scipy.optimize import minimize
 
 from pipeline.geometry import Float, Grid, Surface, transform_points
 from pipeline.registration.frames import sample_frames
+from pipeline.registration.pose_search import climb, pivot_of
+from pipeline.registration.search import Level
 from pipeline.registration.similarity import agreement
 from pipeline.registration.tissue_map import TissueMap, as_seen, blurred, coverage, draw_tissue
 
@@ -173,3 +176,67 @@ class TestAgreement:
         np.testing.assert_allclose(
             explained(between, tissue_map), explained(0.0, middle), atol=1e-5
         )
+
+
+@pytest.fixture(scope="module")
+def pivot():
+    return pivot_of(list(moving_surfaces().values()))
+
+
+@pytest.fixture(scope="module")
+def level(recording, tissue_map):
+    return Level(sample_frames(recording.sweeps, recording.phases, 4.0, 1.5, 20.0), tissue_map)
+
+
+class TestExpansion:
+    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("case", ["as it is", "bright blood", "breath"])
+    def test_slopes_add_up_to_the_way_the_losses_go(self, recording, level, pivot, seed, case):
+        """Their integral along a way of 3 mm in each parameter, by the midpoint rule: straight
+        lines between nodes leave kinks in the losses, which differences would stumble over."""
+        rng = np.random.default_rng(seed)
+        if case == "bright blood":
+            level = replace(level, samples=replace(level.samples, grey=-level.samples.grey))
+        if case == "breath":
+            level = replace(level, shift_mm=rng.normal(0, 3, (level.samples.frames, 3)))
+        steps, count = rng.choice([-3.0, 3.0], 6), 150
+        pose = start_off(recording, seed, 2, 2)
+        first, way = level.losses(pose), np.zeros(level.samples.frames)
+        for _ in range(count):
+            middle = level.expansion(pivot.move(pose, steps / (2 * count)), pivot)
+            way += middle.slopes @ steps / count
+            pose = pivot.move(pose, steps / count)
+
+        last = level.losses(pose)
+
+        # Over a step of 0.02 mm a kink that turns the slope by itself is off by half of it in one
+        # of a hundred steps; numbers are float32.
+        np.testing.assert_allclose(way, last - first, atol=0.01 * np.abs(last - first).max())
+
+    def test_losses_are_those_of_the_agreement(self, recording, level, pivot):
+        pose = start_off(recording, 1, 3, 3)
+        np.testing.assert_allclose(level.expansion(pose, pivot).losses, level.losses(pose))
+
+
+class TestClimb:
+    def test_it_ends_in_one_place_wherever_it_begins(self, recording, level, pivot):
+        ends = [climb(level, start_off(recording, seed, 5, 5), pivot) for seed in range(5)]
+        away = [pivot.distance(end, ends[0]) for end in ends]
+        # The last step is at most 0.02 mm in each of six parameters, and Gauss and Newton's steps
+        # shrink by half or better each time: two ends lie twice that apart at most.
+        assert max(shift_mm for shift_mm, _ in away) < 2 * 0.02 * np.sqrt(3)
+
+    def test_it_goes_as_high_as_a_search_without_slopes(self, recording, level, pivot):
+        start = start_off(recording, 2, 2, 2)
+        found = minimize(
+            lambda step_mm: -level.score(pivot.move(start, step_mm)),
+            np.zeros(6),
+            method="Powell",
+            options={"xtol": 1e-3, "ftol": 1e-7},
+        )
+        assert level.score(climb(level, start, pivot)) > -found.fun - 1e-4
+
+    def test_frames_that_see_nothing_leave_the_pose_alone(self, recording, level, pivot):
+        far = recording.mr_from_tracker.copy()
+        far[:3, 3] += 500
+        np.testing.assert_array_equal(climb(level, far, pivot), far)

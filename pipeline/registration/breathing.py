@@ -65,7 +65,7 @@ def follow_breath(
         placed = replace(level, shift_mm=-depth_mm[:, None] * AXIS)
         at_rest = np.eye(4)
         at_rest[:3, 3] = -rest_mm * AXIS
-        pose = climb(placed.score, at_rest @ pose, pivot)
+        pose = climb(placed, at_rest @ pose, pivot)
     return placed, pose, depth_mm
 
 

@@ -43,8 +43,6 @@ _ROUNDS = 4
 _ELSEWHERE_S, _EQUAL_RIVAL = 0.100, 0.95
 # Up to which share of a sweep's frames neighbours count as correlated, as for the pose.
 _REACH = 0.25
-# Slope, in score a millimetre, at which a pose on the profile is taken for the best.
-_FLATNESS = 3e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +207,7 @@ class _Profile:
 
     def climb(self, pose: Float, offset_s: float) -> Float:
         """The best pose near one, at an offset."""
-        return climb(self.at(offset_s).score, pose, self.pivot, flatness=_FLATNESS)
+        return climb(self.at(offset_s), pose, self.pivot)
 
     def nearest(self, pose: Float, offset_s: float) -> tuple[float, Float] | None:
         """The best of a row of offsets, and the pose there; None where two fit alike."""

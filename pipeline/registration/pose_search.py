@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry import Float, MovingSurface, transform_points
+from pipeline.registration.similarity import Expansion
 
-# The published types of this function leave out options of single methods.
-_minimize: Any = minimize
+ROUGHLY_MM = 0.3
+"""How near an optimum is enough where it is only compared with others."""
 
-Score = Callable[[Float], float]
-"""Agreement at a pose ``mr_from_tracker``; more is better."""
+# Damping in units of the mean curvature, most steps, and the longest of them: a bowl is some
+# millimetres wide.
+_LEAST_DAMPING, _MOST_STEPS, _LONGEST_MM = 1e-3, 40, 5.0
+
+
+class Landscape(Protocol):
+    """Frames and model, as a search sees them."""
+
+    def score(self, mr_from_tracker: Float, /) -> float:
+        """Agreement at a pose; more is better."""
+
+    def expansion(self, mr_from_tracker: Float, pivot: Pivot, /) -> Expansion:
+        """The frames' losses about a pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,44 +106,44 @@ def poses_anywhere(
 
 
 def climb_from_best(
-    score: Score, candidates: list[Float], pivot: Pivot, starts: int, kept: int
+    landscape: Landscape, candidates: list[Float], pivot: Pivot, starts: int, kept: int
 ) -> list[Float]:
     """The best poses reached, to about a millimetre, from the ``starts`` best candidates.
 
     At most ``kept``, the best first, no two within 4 mm and 4 degrees of each other.
     """
-    ranked = sorted(candidates, key=score, reverse=True)[:starts]
-    reached = [climb(score, pose, pivot, step_mm=1.0, flatness=4e-3) for pose in ranked]
+    ranked = sorted(candidates, key=landscape.score, reverse=True)[:starts]
+    reached = [climb(landscape, pose, pivot, ROUGHLY_MM) for pose in ranked]
     apart: list[Float] = []
-    for pose in sorted(reached, key=score, reverse=True):
+    for pose in sorted(reached, key=landscape.score, reverse=True):
         if all(max(pivot.distance(pose, other)) > 4.0 for other in apart):
             apart.append(pose)
     return apart[:kept]
 
 
-def climb(
-    score: Score, pose: Float, pivot: Pivot, step_mm: float = 0.3, flatness: float = 1e-3
-) -> Float:
-    """The optimum of a smooth score uphill of ``pose`` (BFGS).
+def climb(landscape: Landscape, pose: Float, pivot: Pivot, within_mm: float = 0.02) -> Float:
+    """The optimum uphill of ``pose``, by Gauss and Newton's steps, shorter where they do not help
+    (D. W. Marquardt, J Soc Indust Appl Math 11 (1963) 431-441).
 
     Parameters
     ----------
-    step_mm
-        Half the width of the differences that give the slope: wide enough to look past the kinks
-        that linear interpolation leaves at every node.
-    flatness
-        Slope, in score a millimetre, at which to stop: 1e-3 is some hundredths of a millimetre
-        from the optimum of a score near 1 that fades over 5 mm.
+    within_mm
+        A step this short, in each of the six parameters, is the last.
     """
-
-    def loss(motion_mm: Float) -> float:
-        return -score(pivot.move(pose, motion_mm))
-
-    def slope(motion_mm: Float) -> Float:
-        rise = [loss(motion_mm + d) - loss(motion_mm - d) for d in step_mm * np.eye(6)]
-        return np.array(rise) / (2 * step_mm)
-
-    # Such a score bends by about 1 / 30 a square millimetre: so far does the first step trust it.
-    options = {"gtol": flatness, "hess_inv0": 30.0 * np.eye(6)}
-    found = _minimize(loss, np.zeros(6), method="BFGS", jac=slope, options=options)
-    return pivot.move(pose, np.asarray(found.x))
+    damping, here = _LEAST_DAMPING, landscape.expansion(pose, pivot)
+    for _ in range(_MOST_STEPS):
+        mean = np.trace(here.bending) / 6
+        if not mean > 0:
+            break
+        damped = here.bending + damping * mean * np.eye(6)
+        step_mm = -np.linalg.solve(damped, here.slopes.sum(axis=0))
+        step_mm *= min(1.0, _LONGEST_MM / np.abs(step_mm).max())
+        moved = pivot.move(pose, step_mm)
+        there = landscape.expansion(moved, pivot)
+        if there.losses.sum() < here.losses.sum():
+            pose, here, damping = moved, there, max(damping / 10, _LEAST_DAMPING)
+        else:
+            damping *= 10
+        if np.abs(step_mm).max() < within_mm:
+            break
+    return pose

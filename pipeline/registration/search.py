@@ -11,6 +11,7 @@ from pipeline.geometry import Float, Integer, MovingSurface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.frames import Samples, TrackedSweep, choose, sample_frames
 from pipeline.registration.pose_search import (
+    ROUGHLY_MM,
     Pivot,
     climb,
     climb_from_best,
@@ -19,7 +20,7 @@ from pipeline.registration.pose_search import (
     poses_around,
 )
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.similarity import Agreement, agreement
+from pipeline.registration.similarity import Agreement, Expansion, agreement, expansion
 from pipeline.registration.tissue_map import TissueMap, as_seen, blurred, cavities_of, draw_tissue
 
 # The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
@@ -63,6 +64,11 @@ class Level:
     def at(self, mr_from_tracker: Float) -> Agreement:
         """Agreement of each frame at a pose."""
         return agreement(self.samples, self.tissue, mr_from_tracker, self.shift_mm)
+
+    def expansion(self, mr_from_tracker: Float, pivot: Pivot) -> Expansion:
+        """Losses of each frame at a pose, and how they change about it."""
+        arm = pivot.centre_mm, pivot.lever_mm
+        return expansion(self.samples, self.tissue, mr_from_tracker, *arm, self.shift_mm)
 
     def losses(self, mr_from_tracker: Float) -> Float:
         """``(frames,)`` log of the share of each frame that is left unexplained at a pose."""
@@ -135,15 +141,13 @@ class Search:
         """The pose at which the frames agree best with the model."""
         coarse = self.coarse_level(sweeps)
         starts = self.settings.starts * (_MORE_STARTS if self.start is None else 1)
-        rivals = climb_from_best(
-            coarse.score, self.candidates(coarse), self.pivot, starts, kept=_RIVALS
-        )
+        rivals = climb_from_best(coarse, self.candidates(coarse), self.pivot, starts, kept=_RIVALS)
         fine = self.fine_level(sweeps)
         few = fine.thinned(_RIVAL_FRAMES)
         finalists = sorted(rivals, key=few.score, reverse=True)[:_FINALISTS]
-        refined = [climb(few.score, rival, self.pivot, flatness=4e-3) for rival in finalists]
+        refined = [climb(few, rival, self.pivot, ROUGHLY_MM) for rival in finalists]
         fine = fine.thinned(self.settings.max_frames)
-        pose = climb(fine.score, max(refined, key=fine.score), self.pivot)
+        pose = climb(fine, max(refined, key=fine.score), self.pivot)
         elsewhere = [
             fine.score(other)
             for other in refined

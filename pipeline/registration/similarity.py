@@ -11,19 +11,16 @@ Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from numba import njit
 
 from pipeline.geometry import Float, Integer
 from pipeline.registration.frames import Samples
+from pipeline.registration.kernels import SUMS, add_up, bend
 from pipeline.registration.tissue_map import TissueMap
 
-# Per frame: grey with blood and with wall, blood with itself, blood with wall, wall with itself,
-# and the sum of blood and wall.
-_SUMS = 6
 # Grey values of variance 1 explained by less than this say nothing: it keeps the fit solvable
 # where a frame misses the heart.
 _RIDGE = 1e-3
@@ -46,6 +43,23 @@ class Agreement:
         return float(-np.log1p(-self.explained).mean())
 
 
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """How the frames' losses, log(1 - explained), change with a small motion of the tracker."""
+
+    losses: Float
+    """``(frames,)`` at the pose itself."""
+
+    slopes: Float
+    """``(frames, 6)`` a millimetre: shift along x, y, z of the MR frame, then turns about them by
+    so much that a point at the lever's length from the centre moves by a millimetre."""
+
+    bending: Float
+    """``(6, 6)`` a square millimetre: curvature of the sum of the losses by Gauss and Newton, with
+    the fitted coefficients and trend free at every pose (L. Kaufman, "A variable projection method
+    for solving separable nonlinear least squares problems", BIT 15 (1975) 49-57)."""
+
+
 def agreement(
     samples: Samples, tissue: TissueMap, mr_from_tracker: Float, shift_mm: Float | None = None
 ) -> Agreement:
@@ -58,28 +72,123 @@ def agreement(
     shift_mm
         ``(frames, 3)`` LPS: how much further each frame lies in the model; nothing if None.
     """
-    lower, weight = _neighbours(samples.phases, tissue.phases)
-    index_from_mr = np.diag([*(1 / np.array(tissue.grid.spacing_mm)), 1.0])
-    index_from_mr[:3, 3] = -np.array(tissue.grid.origin_mm) / tissue.grid.spacing_mm
-    shift = np.zeros((samples.frames, 3)) if shift_mm is None else shift_mm
-    sums = np.zeros((samples.frames, _SUMS))
-    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
-    _add_up(
+    fit = _fitted(samples, tissue, _Place.of(samples, tissue, mr_from_tracker, shift_mm))
+    return Agreement(fit.explained, fit.sums[:, -1] / np.diff(samples.first))
+
+
+def expansion(
+    samples: Samples,
+    tissue: TissueMap,
+    mr_from_tracker: Float,
+    centre_mm: Float,
+    lever_mm: float,
+    shift_mm: Float | None = None,
+) -> Expansion:
+    """The losses of all frames at a pose, and how they change about it.
+
+    Parameters
+    ----------
+    mr_from_tracker, shift_mm
+        As for `agreement`.
+    centre_mm
+        ``(3,)`` LPS: what is turned about.
+    lever_mm
+        See `Expansion.slopes`.
+    """
+    place = _Place.of(samples, tissue, mr_from_tracker, shift_mm)
+    fit = _fitted(samples, tissue, place)
+    frames = samples.frames
+    pushes, squares = np.zeros((frames, 3, 6)), np.zeros((frames, 6, 6))
+    with_trend = np.zeros((frames, 6, samples.trend.shape[1]))
+    bend(
         samples.points_mm,
         samples.grey,
         samples.trend,
         samples.trend_row,
         samples.first,
-        lower,
-        weight,
+        place.lower,
+        place.weight,
         tissue.share,
-        index_from_mr @ mr_from_tracker,
-        shift / np.array(tissue.grid.spacing_mm),
+        place.index_from_tracker,
+        place.shift,
+        fit.coefficients.astype(np.float32),
+        np.array(tissue.grid.spacing_mm),
+        (np.asarray(centre_mm) - tissue.grid.origin_mm) / tissue.grid.spacing_mm,
+        1 / lever_mm,
+        pushes,
+        squares,
+        with_trend,
+    )
+    return _expanded(fit, np.diff(samples.first), pushes, squares, with_trend)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the frames lie in the model's grid, in space and time."""
+
+    lower: Integer
+    """``(frames,)`` the stored phase at or before each."""
+
+    weight: Float
+    """``(frames,)`` of the phase after it."""
+
+    index_from_tracker: Float
+    """4x4."""
+
+    shift: Float
+    """``(frames, 3)`` nodes."""
+
+    @classmethod
+    def of(
+        cls, samples: Samples, tissue: TissueMap, mr_from_tracker: Float, shift_mm: Float | None
+    ) -> Self:
+        """At a pose, moved on by ``shift_mm`` unless None."""
+        spacing_mm = np.array(tissue.grid.spacing_mm)
+        index_from_mr = np.diag([*(1 / spacing_mm), 1.0])
+        index_from_mr[:3, 3] = -np.array(tissue.grid.origin_mm) / spacing_mm
+        shift = np.zeros((samples.frames, 3)) if shift_mm is None else shift_mm / spacing_mm
+        lower, weight = _neighbours(samples.phases, tissue.phases)
+        return cls(lower, weight, index_from_mr @ mr_from_tracker, shift)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Every frame's grey values fitted by blood and walls."""
+
+    explained: Float
+    """``(frames,)``."""
+
+    coefficients: Float
+    """``(frames, 2)`` of blood and wall."""
+
+    normal: Float
+    """``(frames, 2, 2)`` of the equations that gave them."""
+
+    sums: Float
+    """``(frames, 6)``: see `SUMS`."""
+
+    with_trend: Float
+    """``(frames, 2, columns)`` of blood and wall."""
+
+
+def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
+    sums = np.zeros((samples.frames, SUMS))
+    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
+    add_up(
+        samples.points_mm,
+        samples.grey,
+        samples.trend,
+        samples.trend_row,
+        samples.first,
+        place.lower,
+        place.weight,
+        tissue.share,
+        place.index_from_tracker,
+        place.shift,
         sums,
         with_trend,
     )
-    counts = np.diff(samples.first)
-    return Agreement(_explained(sums, with_trend, counts), sums[:, -1] / counts)
+    return _explained(sums, with_trend, np.diff(samples.first))
 
 
 def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
@@ -92,86 +201,38 @@ def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
     return (lower % len(stored)).astype(np.int64), weight
 
 
-def _explained(sums: Float, with_trend: Float, counts: Integer) -> Float:
+def _explained(sums: Float, with_trend: Float, counts: Integer) -> _Fit:
     """Variance explained by blood and walls beyond the trend, blood darker than the rest."""
     blood_grey, wall_grey = sums[:, 0], sums[:, 1]
-    trend_b, trend_w = with_trend[:, 0], with_trend[:, 1]
     ridge = _RIDGE * counts
-    bb = sums[:, 2] - (trend_b**2).sum(axis=1) + ridge
-    bw = sums[:, 3] - (trend_b * trend_w).sum(axis=1)
-    ww = sums[:, 4] - (trend_w**2).sum(axis=1) + ridge
+    normal = sums[:, [[2, 3], [3, 4]]] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
+    normal[:, [0, 1], [0, 1]] += ridge[:, None]
+    bb, bw, ww = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
     # Normal equations of two unknowns, solved by hand for all frames at once.
     determinant = bb * ww - bw**2
     blood = (ww * blood_grey - bw * wall_grey) / determinant
     wall = (bb * wall_grey - bw * blood_grey) / determinant
-    both = blood * blood_grey + wall * wall_grey
     # A fit that makes blood bright is one by chance: then only the walls count.
-    fitted = np.where(blood < 0, both, wall_grey**2 / ww)
-    return np.asarray(np.clip(fitted / counts, 0, 0.999))
+    wall = np.where(blood < 0, wall, wall_grey / ww)
+    blood = np.minimum(blood, 0)
+    explained = np.clip((blood * blood_grey + wall * wall_grey) / counts, 0, 0.999)
+    return _Fit(explained, np.stack([blood, wall], axis=1), normal, sums, with_trend)
 
 
-@njit(cache=True, nogil=True)
-def _add_up(  # type: ignore[no-untyped-def]
-    points,
-    grey,
-    trend,
-    trend_row,
-    first,
-    lower,
-    weight,
-    share,
-    index_from_tracker,
-    shift,
-    sums,
-    with_trend,
-):
-    """Per frame: products of the shares with grey, trend and each other, and their own sum."""
-    phases, depth, height, width, _ = share.shape
-    m = index_from_tracker
-    for f in range(len(first) - 1):
-        before, after, late = lower[f], (lower[f] + 1) % phases, weight[f]
-        for s in range(first[f], first[f + 1]):
-            px, py, pz = points[s, 0], points[s, 1], points[s, 2]
-            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[f, 0]
-            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[f, 1]
-            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[f, 2]
-            i, j, k = math.floor(x), math.floor(y), math.floor(z)
-            if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
-                u, v, w = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-                blood, wall = _interpolate(share, before, k, j, i, w, v, u)
-                blood_late, wall_late = _interpolate(share, after, k, j, i, w, v, u)
-                blood += late * (blood_late - blood)
-                wall += late * (wall_late - wall)
-                if blood > 0 or wall > 0:
-                    row = trend[trend_row[f] + s - first[f]]
-                    _accumulate(sums[f], with_trend[f], blood, wall, grey[s], row)
-
-
-@njit(cache=True, nogil=True)
-def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def]
-    """Trilinear blood and wall in one phase."""
-    blood, wall = np.float32(0), np.float32(0)
-    one = np.float32(1)
-    for dk in range(2):
-        wk = w if dk else one - w
-        for dj in range(2):
-            wj = wk * (v if dj else one - v)
-            near, far = wj * (one - u), wj * u
-            row = share[phase, k + dk, j + dj]
-            blood += near * row[i, 0] + far * row[i + 1, 0]
-            wall += near * row[i, 1] + far * row[i + 1, 1]
-    return blood, wall
-
-
-@njit(cache=True, nogil=True)
-def _accumulate(sums, with_trend, blood, wall, grey, trend):  # type: ignore[no-untyped-def]
-    """Add one sample to a frame's sums."""
-    sums[0] += blood * grey
-    sums[1] += wall * grey
-    sums[2] += blood * blood
-    sums[3] += blood * wall
-    sums[4] += wall * wall
-    sums[5] += blood + wall
-    for c in range(len(trend)):
-        with_trend[0, c] += blood * trend[c]
-        with_trend[1, c] += wall * trend[c]
+def _expanded(
+    fit: _Fit, counts: Integer, pushes: Float, squares: Float, with_trend: Float
+) -> Expansion:
+    """Slopes and curvature from what `bend` has added up."""
+    # What blood and wall change where the trend is taken out of them.
+    beyond = pushes[:, 1:] - np.einsum("fit,fct->fci", with_trend, fit.with_trend)
+    rest = pushes[:, 0] - np.einsum("fc,fci->fi", fit.coefficients, beyond)
+    bent = squares - np.einsum("fit,fjt->fij", with_trend, with_trend)
+    fitted = np.linalg.solve(fit.normal, beyond)
+    # Where blood would be bright, walls are all that is fitted.
+    dark = (fit.coefficients[:, 0] < 0)[:, None]
+    fitted[:, 0] = np.where(dark, fitted[:, 0], 0)
+    fitted[:, 1] = np.where(dark, fitted[:, 1], beyond[:, 1] / fit.normal[:, 1, 1, None])
+    bent -= np.einsum("fci,fcj->fij", beyond, fitted)
+    worth = 2 / (counts * (1 - fit.explained))
+    slopes = -worth[:, None] * rest
+    return Expansion(np.log1p(-fit.explained), slopes, np.einsum("f,fij->ij", worth, bent))

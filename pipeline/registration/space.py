@@ -254,7 +254,7 @@ def _refined(everything: Level, pose: Float, search: Search) -> Float:
     if len(good) < search.settings.min_frames:
         return pose
     level = everything.only(good).thinned(search.settings.max_frames)
-    return climb(level.score, pose, search.pivot)
+    return climb(level, pose, search.pivot)
 
 
 def _bears_out(level: Level, pose: Float, pivot: Pivot) -> Mask:

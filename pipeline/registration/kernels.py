@@ -1,0 +1,164 @@
+"""Sums over the samples of every frame, at one pose: the inner loops of `similarity`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+SUMS = 6
+"""Per frame: grey with blood and with wall, blood with itself, blood with wall, wall with itself,
+and the sum of blood and wall."""
+
+
+@njit(cache=True, nogil=True)
+def add_up(  # type: ignore[no-untyped-def]
+    points,
+    grey,
+    trend,
+    trend_row,
+    first,
+    lower,
+    weight,
+    share,
+    index_from_tracker,
+    shift,
+    sums,
+    with_trend,
+):
+    """Per frame: products of the shares with grey, trend and each other, and their own sum."""
+    phases, depth, height, width, _ = share.shape
+    m = index_from_tracker
+    for f in range(len(first) - 1):
+        before, after, late = lower[f], (lower[f] + 1) % phases, weight[f]
+        for s in range(first[f], first[f + 1]):
+            px, py, pz = points[s, 0], points[s, 1], points[s, 2]
+            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[f, 0]
+            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[f, 1]
+            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[f, 2]
+            i, j, k = math.floor(x), math.floor(y), math.floor(z)
+            if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
+                u, v, w = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+                blood, wall = _interpolate(share, before, k, j, i, w, v, u)
+                blood_late, wall_late = _interpolate(share, after, k, j, i, w, v, u)
+                blood += late * (blood_late - blood)
+                wall += late * (wall_late - wall)
+                if blood > 0 or wall > 0:
+                    row = trend[trend_row[f] + s - first[f]]
+                    _accumulate(sums[f], with_trend[f], blood, wall, grey[s], row)
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def]
+    """Trilinear blood and wall in one phase."""
+    blood, wall = np.float32(0), np.float32(0)
+    one = np.float32(1)
+    for dk in range(2):
+        wk = w if dk else one - w
+        for dj in range(2):
+            wj = wk * (v if dj else one - v)
+            near, far = wj * (one - u), wj * u
+            row = share[phase, k + dk, j + dj]
+            blood += near * row[i, 0] + far * row[i + 1, 0]
+            wall += near * row[i, 1] + far * row[i + 1, 1]
+    return blood, wall
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(sums, with_trend, blood, wall, grey, trend):  # type: ignore[no-untyped-def]
+    """Add one sample to a frame's sums."""
+    sums[0] += blood * grey
+    sums[1] += wall * grey
+    sums[2] += blood * blood
+    sums[3] += blood * wall
+    sums[4] += wall * wall
+    sums[5] += blood + wall
+    for c in range(len(trend)):
+        with_trend[0, c] += blood * trend[c]
+        with_trend[1, c] += wall * trend[c]
+
+
+@njit(cache=True, nogil=True)
+def bend(  # type: ignore[no-untyped-def]
+    points,
+    grey,
+    trend,
+    trend_row,
+    first,
+    lower,
+    weight,
+    share,
+    index_from_tracker,
+    shift,
+    coefficients,
+    spacing_mm,
+    centre,
+    turn,
+    pushes,
+    squares,
+    with_trend,
+):
+    """Per frame: products of the fitted picture's six changes with a step of the pose with grey,
+    blood and wall (``pushes``), with each other, and with the trend."""
+    phases, depth, height, width, _ = share.shape
+    m = index_from_tracker
+    slope, change = np.zeros(3), np.zeros(6)
+    for f in range(len(first) - 1):
+        before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
+        for s in range(first[f], first[f + 1]):
+            px, py, pz = points[s, 0], points[s, 1], points[s, 2]
+            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
+            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
+            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+            at = x + shift[f, 0], y + shift[f, 1], z + shift[f, 2]
+            i, j, k = math.floor(at[0]), math.floor(at[1]), math.floor(at[2])
+            if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
+                near = np.float32(at[0] - i), np.float32(at[1] - j), np.float32(at[2] - k)
+                slope[:] = 0
+                blood, wall = _slope(share, before, k, j, i, near, coefficients[f], slope)
+                if late > 0:
+                    slope *= 1 - late
+                    now = _slope(share, after, k, j, i, near, late * coefficients[f], slope)
+                    blood += late * (now[0] - blood)
+                    wall += late * (now[1] - wall)
+                if blood > 0 or wall > 0:
+                    for axis in range(3):
+                        change[axis] = slope[axis] / spacing_mm[axis]
+                    ax = (x - centre[0]) * spacing_mm[0] * turn
+                    ay = (y - centre[1]) * spacing_mm[1] * turn
+                    az = (z - centre[2]) * spacing_mm[2] * turn
+                    change[3] = ay * change[2] - az * change[1]
+                    change[4] = az * change[0] - ax * change[2]
+                    change[5] = ax * change[1] - ay * change[0]
+                    row = trend[trend_row[f] + s - first[f]]
+                    for a in range(6):
+                        pushes[f, 0, a] += change[a] * grey[s]
+                        pushes[f, 1, a] += change[a] * blood
+                        pushes[f, 2, a] += change[a] * wall
+                        for b in range(6):
+                            squares[f, a, b] += change[a] * change[b]
+                        for c in range(len(row)):
+                            with_trend[f, a, c] += change[a] * row[c]
+
+
+@njit(cache=True, nogil=True)
+def _slope(share, phase, k, j, i, near, coefficients, slope):  # type: ignore[no-untyped-def]
+    """Trilinear blood and wall in one phase; adds the slope of their sum under the coefficients,
+    a node, to ``slope``."""
+    blood, wall = np.float32(0), np.float32(0)
+    one = np.float32(1)
+    for dk in range(2):
+        wk, sk = (near[2], one) if dk else (one - near[2], -one)
+        for dj in range(2):
+            wj, sj = (near[1], one) if dj else (one - near[1], -one)
+            for di in range(2):
+                wi, si = (near[0], one) if di else (one - near[0], -one)
+                node = share[phase, k + dk, j + dj, i + di]
+                value = coefficients[0] * node[0] + coefficients[1] * node[1]
+                blood += wi * wj * wk * node[0]
+                wall += wi * wj * wk * node[1]
+                slope[0] += si * wj * wk * value
+                slope[1] += wi * sj * wk * value
+                slope[2] += wi * wj * sk * value
+    return blood, wall
