@@ -9,6 +9,7 @@ wrong place (mirrored, or in reverse order): their best score is what chance rea
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -242,10 +243,13 @@ def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> f
     """The best score that frames in the wrong place reach."""
     # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
     nearby = replace(search, start=pose) if search.start is None else search
-    return max(
-        nearby.best([displaced(sweep) for sweep in sweeps]).score
-        for displaced in (mirrored, backwards)
-    )
+
+    def reached(displaced: Callable[[TrackedSweep], TrackedSweep]) -> float:
+        return nearby.best([displaced(sweep) for sweep in sweeps]).score
+
+    # Both at the same time: sums over samples let others run while they count.
+    with ThreadPoolExecutor(2) as pool:
+        return max(pool.map(reached, (mirrored, backwards)))
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:

@@ -8,7 +8,7 @@ blood meets tissue the wall mirrors sound: that echo is drawn apart, for its str
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ _BEAM_MM, _ECHO_OF_BLOOD = 1.0, 0.05
 _WALL_MM = 2.0
 # Room for the widest blur to fade.
 _MARGIN_MM = 12.0
-# Phases that are drawn at the same time: NumPy and SciPy let others run while they count.
+# Phases that are worked on at the same time: NumPy and SciPy let others run while they count.
 _THREADS = 2
 
 
@@ -85,9 +85,14 @@ def draw_tissue(
         share[index, ..., 0] = blood
         share[index, ..., 1] = 4 * soft * (1 - soft)
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(draw, range(len(phases))))
+    _in_turn(draw, len(phases))
     return TissueMap(share, phases, grid)
+
+
+def _in_turn(work: Callable[[int], None], phases: int) -> None:
+    """Do the work of every phase, some of them at the same time."""
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(work, range(phases)))
 
 
 def _grey_of_muscle(
@@ -130,10 +135,14 @@ def as_seen(tissue: TissueMap) -> TissueMap:
     finite width touches a wall, blood looks like muscle already, and cavities look smaller.
     """
     width = _BEAM_MM / np.array(tissue.grid.spacing_mm[::-1])
-    blood = gaussian_filter(tissue.share[..., 0], (0, *width), mode="constant")
     share = tissue.share.copy()
-    dark = np.log(np.maximum(1 - blood, 0) + _ECHO_OF_BLOOD) / np.log(_ECHO_OF_BLOOD)
-    share[..., 0] = np.clip(dark, 0, 1)
+
+    def see(index: int) -> None:
+        blood = gaussian_filter(tissue.share[index, ..., 0], width, mode="constant")
+        dark = np.log(np.maximum(1 - blood, 0) + _ECHO_OF_BLOOD) / np.log(_ECHO_OF_BLOOD)
+        share[index, ..., 0] = np.clip(dark, 0, 1)
+
+    _in_turn(see, len(share))
     return TissueMap(share, tissue.phases, tissue.grid)
 
 
@@ -145,9 +154,14 @@ def blurred(tissue: TissueMap, sigma_mm: float) -> TissueMap:
     """
     grid = tissue.grid
     sigma = sigma_mm / np.array(grid.spacing_mm[::-1])
-    share = gaussian_filter(tissue.share, (0, *sigma, 0), mode="constant", truncate=3)
     every = max(1, int(0.8 * sigma.min()))
-    kept = np.ascontiguousarray(share[:, ::every, ::every, ::every])
+    kept = tissue.share[:, ::every, ::every, ::every].copy()
+
+    def blur(index: int) -> None:
+        soft = gaussian_filter(tissue.share[index], (*sigma, 0), mode="constant", truncate=3)
+        kept[index] = soft[::every, ::every, ::every]
+
+    _in_turn(blur, len(kept))
     x_mm, y_mm, z_mm = (every * length_mm for length_mm in grid.spacing_mm)
     coarser = Grid(kept.shape[1:4], grid.origin_mm, (x_mm, y_mm, z_mm))
     return TissueMap(kept, tissue.phases, coarser)
