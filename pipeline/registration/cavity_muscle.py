@@ -85,8 +85,7 @@ class CineOnGrid:
 
     def in_voxels(self, share: Float32) -> Float:
         """``(slice, row, column)``: share of each voxel, from that of the grid's nodes."""
-        thirds = [map_coordinates(share, places, order=1) for places in self.grid_from_voxel]
-        return np.asarray(np.mean(thirds, axis=0)).reshape(self.intensity.shape[1:])
+        return _mean_at(self.grid_from_voxel, share).reshape(self.intensity.shape[1:])
 
     def grey_of_muscle(self, index: int, heart: Float32, blood: Float32) -> float | None:
         """Median grey in phase number ``index`` where there is heart and no blood; None where no
@@ -108,8 +107,10 @@ class CineOnGrid:
         blood, ventricles
             ``(z, y, x)`` shares of all cavities and of the ventricles alone, by their surfaces.
         """
-        expected, inside = self.in_voxels(blood), self.in_voxels(ventricles)
-        muscle = np.zeros(inside.shape)
+        inside = self.in_voxels(ventricles)
+        looked_at = inside > _LEAST_INSIDE
+        expected, muscle = np.zeros(inside.shape), np.zeros(inside.shape)
+        expected[looked_at] = _mean_at(self.grid_from_voxel[:, :, looked_at.ravel()], blood)
         for number, picture in enumerate(self.intensity[index]):
             deep = inside[number] > _ALL
             if deep.sum() < _LEAST_VOXELS:
@@ -119,6 +120,13 @@ class CineOnGrid:
             if contrast > 0:
                 missing = expected[number] - (picture - grey_of_muscle) / contrast
                 missing = np.clip((missing - _DOUBTFUL) / (1 - _DOUBTFUL), 0, 1)
-                muscle[number] = np.where(inside[number] > _LEAST_INSIDE, missing, 0)
-        at_nodes = map_coordinates(muscle, self.voxel_from_grid, order=1, mode="nearest")
-        return np.minimum(at_nodes.reshape(blood.shape), ventricles).astype(np.float32)
+                muscle[number] = np.where(looked_at[number], missing, 0)
+        share, within = np.zeros_like(ventricles), ventricles > 0
+        places = self.voxel_from_grid[:, within.ravel()]
+        share[within] = map_coordinates(muscle, places, order=1, mode="nearest")
+        return np.minimum(share, ventricles)
+
+
+def _mean_at(places: Float, share: Float32) -> Float:
+    """``(n,)``: mean of a share over the ``(3, 3, n)`` places of each voxel."""
+    return np.asarray(np.mean([map_coordinates(share, one, order=1) for one in places], axis=0))
