@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,17 +37,76 @@ def read_mesh(path: Path) -> Surface:
     """
     import pyvista
 
+    require_whole(path)
     try:
         mesh = pyvista.read(path)
+        if isinstance(mesh, pyvista.PolyData) and mesh.n_cells:
+            mesh = mesh if mesh.is_all_triangles else mesh.triangulate()
+            mesh = mesh.clean() if path.suffix.lower() == ".stl" else mesh
+            vertices_mm = np.asarray(mesh.points, dtype=np.float64)
+            triangles = np.asarray(mesh.regular_faces, dtype=np.int64)
     except Exception as error:  # VTK's readers raise whatever the format's parser raises
         raise InputError(f"{path}: cannot be read as a surface ({error})") from error
-    if not isinstance(mesh, pyvista.PolyData) or not mesh.n_cells:
+    if not isinstance(mesh, pyvista.PolyData) or not mesh.n_cells or not len(triangles):
         raise InputError(f"{path}: holds no triangles; a closed surface is needed")
-    if not mesh.is_all_triangles:
-        mesh = mesh.triangulate()
-    if path.suffix.lower() == ".stl":
-        mesh = mesh.clean()
-    return Surface(
-        np.asarray(mesh.points, dtype=np.float64),
-        np.asarray(mesh.regular_faces, dtype=np.int64),
-    )
+    return Surface(vertices_mm, triangles)
+
+
+def require_whole(path: Path) -> None:
+    """Refuse a PLY file that ends before what its header promises: VTK's reader would crash.
+
+    Raises
+    ------
+    InputError
+        When it does, or has no header.
+    """
+    if path.suffix.lower() != ".ply":
+        return
+    try:
+        head, found, body = path.read_bytes().partition(b"end_header")
+        lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+        least = _least_size(lines, any(line[:2] == ["format", "ascii"] for line in lines))
+    except (OSError, KeyError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: cannot be read as a PLY file ({error})") from error
+    if not found:
+        raise InputError(f"{path}: is no whole PLY file: its header does not end; copy it again")
+    there = len(body.splitlines()) - 1 if least.in_lines else len(body.lstrip(b"\r")) - 1
+    if there < least.size:
+        unit = "lines" if least.in_lines else "bytes"
+        raise InputError(
+            f"{path}: is cut off: {max(there, 0)} {unit} follow the header, which promises "
+            f"{least.size} or more; copy it again"
+        )
+
+
+class _Least(NamedTuple):
+    """How long the body of a PLY file must be."""
+
+    size: int
+    in_lines: bool
+
+
+def _least_size(lines: list[list[str]], in_lines: bool) -> _Least:
+    """What a PLY header's lines promise: faces have three corners or more."""
+    size = each = count = 0
+    for words in lines:
+        if words[:1] == ["element"]:
+            size += count * each
+            count, each = int(words[2]), 1 if in_lines else 0
+        elif words[:2] == ["property", "list"] and not in_lines:
+            each += _PLY_BYTES[words[2]] + 3 * _PLY_BYTES[words[3]] * words[4].startswith("vertex_")
+        elif words[:1] == ["property"] and not in_lines:
+            each += _PLY_BYTES[words[1]]
+    return _Least(size + count * each, in_lines)
+
+
+_PLY_BYTES = {
+    name: size
+    for size, names in {
+        1: "char uchar int8 uint8",
+        2: "short ushort int16 uint16",
+        4: "int uint float int32 uint32 float32",
+        8: "double float64",
+    }.items()
+    for name in names.split()
+}

@@ -1,14 +1,18 @@
-"""Meshes of level sets: closed, outward, even, without folds; and their operators."""
+"""Meshes of level sets: closed, outward, even, without folds; their operators; their files."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import pyvista
 from surface_shapes import crossing_triangles, ellipsoid, two_lobes, voxel_centres
 
-from pipeline.errors import StageError
+from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Surface
+from pipeline.meshes import read_mesh
 from pipeline.surface.level_set import LevelSet, smooth_level_set
 from pipeline.surface.mesh import (
     adjacency,
@@ -148,3 +152,16 @@ def test_a_sound_mesh_is_not_touched_by_untangling():
     np.testing.assert_array_equal(
         untangled(surface.vertices_mm, surface.triangles, level), surface.vertices_mm
     )
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("left", [0.01, 0.5, 0.99])
+def test_a_ply_file_that_is_cut_off_is_refused(tmp_path: Path, binary: bool, left: float) -> None:
+    """VTK's reader ends the whole process on one."""
+    whole, cut = tmp_path / "whole.ply", tmp_path / "cut.ply"
+    pyvista.Sphere().save(whole, binary=binary)
+    assert len(read_mesh(whole).triangles) == pyvista.Sphere().n_cells
+    content = whole.read_bytes()
+    cut.write_bytes(content[: round(left * len(content))])
+    with pytest.raises(InputError, match=r"cut\.ply: is (cut off: |no whole PLY file)"):
+        read_mesh(cut)

@@ -21,6 +21,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pipeline.errors import InputError
 from pipeline.field.fixture import Section
 from pipeline.geometry import Float
+from pipeline.meshes import require_whole
 
 Point = tuple[float, float, float]
 
@@ -140,6 +141,7 @@ def _corners_mm(path: Path) -> Float:
     """``(n, 3, 3)`` corners of a mesh file's triangles."""
     import pyvista
 
+    require_whole(path)
     try:
         with warnings.catch_warnings():
             # Of a damaged file VTK only warns, and goes on with what it has.
