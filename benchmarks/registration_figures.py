@@ -100,6 +100,7 @@ def registered(
         "mean_mm": float(error.mean()),
         "quantiles_mm": np.quantile(error, np.linspace(0, 1, 21)).tolist(),
         "expected_mm": found.expected_mm,
+        "chance_under_2_mm": found.chance_under_2_mm,
         "error": motion_between(
             found.mr_from_tracker, study.mr_from_tracker, found.centre_mm
         ).tolist(),
@@ -264,7 +265,22 @@ def calibration(results: list[dict[str, Any]]) -> list[str]:
         rms = np.sqrt((means**2).mean())
         under = f"{(means < CAPTURED_MM).mean():.1%}"
         text.append(f"| {verdict} | {len(some)} | {under} | {expected:.2f} | {rms:.2f} |")
-    return [*text, "", *thresholds(results), "", squared_error(results)]
+    return [*text, "", *chances(results), "", *thresholds(results), "", squared_error(results)]
+
+
+def chances(results: list[dict[str, Any]]) -> list[str]:
+    """The chance that results give themselves to be under 2 mm, and how many are."""
+    trusted = [one for one in results if graded(one) in ("good", "doubtful")]
+    text = ["| chance of under 2 mm | runs | mean chance | under 2 mm |", "|---|---|---|---|"]
+    for low, high in ((0.0, 0.7), (0.7, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.01), (0.0, 1.01)):
+        some = [one for one in trusted if low <= one["chance_under_2_mm"] < high]
+        if some:
+            mean = np.mean([one["chance_under_2_mm"] for one in some])
+            under = np.mean([one["mean_mm"] < CAPTURED_MM for one in some])
+            text.append(
+                f"| {low:.2f} to {min(high, 1):.2f} | {len(some)} | {mean:.2f} | {under:.2f} |"
+            )
+    return text
 
 
 def graded(one: dict[str, Any], good_tre_mm: float | None = None) -> str:
@@ -286,8 +302,8 @@ def thresholds(results: list[dict[str, Any]]) -> list[str]:
     that are even, to choose by, and odd, to see whether the choice holds."""
     text = ["| good_tre_mm | even seeds: good | under 2 mm | odd seeds: good | under 2 mm |"]
     text.append("|---|---|---|---|---|")
-    for limit_mm in np.arange(1.5, 2.41, 0.1):
-        cells = [f"{limit_mm:.1f}"]
+    for limit_mm in np.arange(1.5, 2.01, 0.05):
+        cells = [f"{limit_mm:.2f}"]
         for odd in (0, 1):
             means = [
                 one["mean_mm"]

@@ -203,26 +203,37 @@ def test_stale_products_are_not_offered_as_if_they_were_current(tmp_path, state)
 @pytest.mark.parametrize(
     ("verdict", "reason", "calibration", "line"),
     [
-        ("good", "", "", "good, expected error over the heart 1.5 mm"),
+        (
+            "good",
+            "",
+            "",
+            "good, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%)",
+        ),
         (
             "doubtful",
             "30 of 80 frames bear the pose out",
             "",
-            "doubtful, expected error over the heart 1.5 mm, "
+            "doubtful, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%), "
             "because: 30 of 80 frames bear the pose out",
         ),
         (
             "good",
             "",
             "calibration of left corrected by 0.2 ± 0.9 mm and 0.1 ± 0.8 degrees",
-            "good, expected error over the heart 1.5 mm, widened by calibration: per_sweep",
+            "good, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%), "
+            "widened by calibration: per_sweep",
         ),
     ],
 )
 def test_the_summary_says_what_the_registration_is_worth(
     tmp_path: Path, verdict: str, reason: str, calibration: str, line: str
 ) -> None:
-    figures = {"verdict": verdict, "reason": reason, "expected_tre_mm": 1.541}
+    figures = {
+        "verdict": verdict,
+        "reason": reason,
+        "expected_tre_mm": 1.541,
+        "chance_under_2_mm": 0.957,
+    }
     stage = {"status": "done", "figures": {**figures, "calibration": calibration}}
     record = {"status": "done", "stages": {"register": stage}}
     assert f"verdict   registration {line}" in summary(record, tmp_path).splitlines()

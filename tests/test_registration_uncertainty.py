@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi
 
 from pipeline.geometry import transform_points
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.uncertainty import (
+    chance_below,
     curvature_at,
     expected_tre_mm,
     floor_of,
@@ -117,6 +119,31 @@ def test_expected_error_is_that_of_drawn_poses(seed):
     drawn = np.sqrt(((moved + steps[:, :3] - point) ** 2).sum(axis=1).mean())
     expected = expected_tre_mm(covariance, PIVOT.centre_mm, point[None])[0]
     assert expected == pytest.approx(drawn, rel=0.08)
+
+
+class TestChance:
+    """Counts of 4,000 draws have a standard deviation of 0.008 at most: within four of it."""
+
+    @pytest.mark.parametrize(("sd_mm", "limit_mm"), [(0.5, 1.0), (1.0, 2.0), (1.0, 1.0)])
+    def test_shifts_alike_in_all_directions_have_a_chi_of_three(self, sd_mm, limit_mm):
+        covariance = np.diag([sd_mm**2] * 3 + [0.0] * 3)
+        points_mm = np.random.default_rng(0).normal(0, 40, (5, 3))
+        found = chance_below(covariance, PIVOT.centre_mm, points_mm, limit_mm)
+        assert found == pytest.approx(chi(3).cdf(limit_mm / sd_mm), abs=0.032)
+
+    def test_turns_about_two_axes_move_a_point_on_the_third_by_a_chi_of_two(self):
+        covariance = np.diag([0.0, 0, 0, 0.02**2, 0.02**2, 1.0])
+        on_axis_mm = PIVOT.centre_mm + np.array([[0, 0, 50.0]])
+        found = chance_below(covariance, PIVOT.centre_mm, on_axis_mm, 1.5)
+        assert found == pytest.approx(chi(2).cdf(1.5 / (0.02 * 50)), abs=0.032)
+
+    def test_it_is_the_mean_over_the_points_that_counts(self):
+        """A turn moves the points at its axis by nothing and one far away by the more."""
+        covariance = np.diag([0.0, 0, 0, 0, 0, 0.05**2])
+        points_mm = PIVOT.centre_mm + np.array([[0, 0, 9.0], [60.0, 0, 0]])
+        found = chance_below(covariance, PIVOT.centre_mm, points_mm, 2.0)
+        # Mean 30 |turn| mm below 2: |turn| < 4 / 60.
+        assert found == pytest.approx(chi(1).cdf(4 / 60 / 0.05), abs=0.032)
 
 
 def test_floor_alone_gives_its_own_error_at_the_centre_and_at_the_lever():

@@ -44,7 +44,7 @@ class RegisterSettings(BaseModel):
     model_error_mm: float = Field(0.5, ge=0, le=10)
     """Standard deviation of what all frames share, such as the surfaces' error: along each axis in
     shift, and about each axis at the heart's own radius. No spread between frames shows it."""
-    good_tre_mm: float = Field(1.9, gt=0)
+    good_tre_mm: float = Field(1.65, gt=0)
     """Expected error over the heart up to which a trusted registration is called good."""
     worst_tre_mm: float = Field(4.0, gt=0)
     """Expected error over the heart beyond which it is called failed."""

@@ -27,6 +27,7 @@ from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.tissue_map import cavities_of
 from pipeline.registration.uncertainty import (
+    chance_below,
     curvature_at,
     expected_tre_mm,
     floor_of,
@@ -82,6 +83,9 @@ class Registration:
 
     expected_mm: float
     """Root mean square of the expected error over the heart."""
+
+    chance_under_2_mm: float
+    """Probability that the mean error over the heart is under 2 mm, by the covariance."""
 
     breath_mm: Float
     """``(frames,)`` how far the heart has moved with breathing, along
@@ -355,6 +359,7 @@ def _summarise(
         covariance=covariance,
         centre_mm=pivot.centre_mm,
         expected_mm=float(np.sqrt((expected**2).mean())),
+        chance_under_2_mm=chance_below(covariance, pivot.centre_mm, heart_mm, 2.0),
         breath_mm=breath_mm,
         corrections=corrections,
         verdict=verdict.grade,

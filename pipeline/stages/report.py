@@ -100,8 +100,9 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
         rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
         said = [register["verdict"], register["reason"], register["calibration"]]
         rows.append(("registration", "; ".join(filter(None, said))))
-        expected_mm = register["expected_tre_mm"]
-        rows.append(("expected registration error over the heart", f"{expected_mm:.1f} mm"))
+        expected_mm, chance = register["expected_tre_mm"], register["chance_under_2_mm"]
+        worth = f"{expected_mm:.1f} mm; under 2 mm with a chance of {chance:.0%}"
+        rows.append(("expected registration error over the heart", worth))
     off_mm = accuracy["surface_error_p99_mm"]
     rows.append(("error of the field on the surface, 99 places in 100", f"{off_mm:.2f} mm"))
     return rows
