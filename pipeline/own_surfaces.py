@@ -28,6 +28,9 @@ from pipeline.study import describe_validation
 Row = tuple[float, float, float, float]
 Transform = tuple[Row, Row, Row, Row]
 
+SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
+"""From end to end; a heart in metres or micrometres lies outside."""
+
 NUMBERED = re.compile(r"(?P<structure>.+)_(?P<number>\d+)")
 
 
@@ -39,8 +42,8 @@ class Timing(BaseModel):
     phases: tuple[float, ...] | None = None
     """Rising within [0, 1), one a file; evenly spaced from 0 when left out."""
 
-    rr_s: float | None = Field(default=None, gt=0)
-    """Mean duration of a heartbeat."""
+    rr_s: float | None = Field(default=None, gt=0, le=60)
+    """Mean duration of a heartbeat, or of what else makes the surfaces move: seconds."""
 
     mr_from_tracker: Transform | None = None
     """4x4, where a tracker is registered to the surfaces' frame."""
@@ -199,6 +202,12 @@ def read_own_surfaces(folder: Path, only: Collection[str] | None = None) -> OwnS
 
 def _closed(path: Path) -> Any:
     surface = read_mesh(path)
+    size_mm = float(np.ptp(surface.vertices_mm, axis=0).max())
+    if not SMALLEST_MM <= size_mm <= LARGEST_MM:
+        raise InputError(
+            f"{path}: measures {size_mm:.3g} mm from end to end, surfaces between {SMALLEST_MM:g} "
+            f"and {LARGEST_MM:g} mm are taken; is it in millimetres?"
+        )
     require_closed(surface, str(path))
     return surface
 

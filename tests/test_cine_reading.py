@@ -207,6 +207,13 @@ def test_a_file_of_one_phase_is_answered_with_what_to_do(tmp_path: Path) -> None
         read_nifti_cine(tmp_path / "ed.nii.gz", None)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_voxels_in_metres_or_micrometres_are_named(tmp_path: Path, unit: float) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1.5 * unit, 1.5 * unit, 8 * unit, 1]))
+    with pytest.raises(InputError, match=r"its voxels measure .* write its affine in millimetres"):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+
+
 def test_a_sheared_affine_is_refused(tmp_path: Path) -> None:
     affine = np.diag([1.5, 1.5, 10, 1.0])
     affine[0, 1] = 0.2

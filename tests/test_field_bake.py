@@ -370,6 +370,11 @@ def inward_box(folder):
         (lambda f: save(f / "ball" / "x.vtp", sphere(5, 2)), r"x\.vtp: in a structure's folder"),
         (lambda f: (f / "phases.json").write_text('{"phases": [0, 0.5]}'), "2 phases for 3"),
         (lambda f: (f / "phases.json").write_text('{"phase": []}'), "unknown key"),
+        (lambda f: (f / "phases.json").write_text('{"rr_s": 800}'), "rr_s: .* equal to 60"),
+        (
+            lambda f: save(f / "ball" / "000.vtp", sphere(0.03, 2)),
+            r"000\.vtp: measures 0\.06 mm .*milli",
+        ),
         (lambda f: (f / "phases.json").write_text("{"), r"phases\.json: cannot be read as JSON"),
         (lambda f: shutil.rmtree(f), "no such folder"),
         (lambda f: (shutil.rmtree(f), f.mkdir()), r"holds no \.vtp"),

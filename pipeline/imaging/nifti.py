@@ -22,6 +22,9 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
 
+VOXEL_MM = (0.1, 50.0)
+"""Edges of a cine's voxels; outside is a unit mistaken."""
+
 
 def read_image(path: Path) -> tuple[npt.NDArray[Any], Float]:
     """Read a NIfTI file as ``(..., z, y, x)`` and ``mr_from_index`` in LPS millimetres.
@@ -79,6 +82,13 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         raise InputError(
             f"{path}: {slice_count} slices of {phase_count} phases; "
             f"at least {MIN_SLICES} slices of {MIN_PHASES} phases are needed"
+        )
+    edges_mm = np.linalg.norm(mr_from_index[:3, :3], axis=0)
+    if edges_mm.min() < VOXEL_MM[0] or edges_mm.max() > VOXEL_MM[1]:
+        raise InputError(
+            f"{path}: its voxels measure {' x '.join(f'{edge:.3g}' for edge in edges_mm)} mm, a "
+            f"cine's edges are {VOXEL_MM[0]:g} to {VOXEL_MM[1]:g} mm; write its affine in "
+            "millimetres"
         )
     triggers, own_rr_ms, source = _timing(image, path, timing, rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(timing or path))
