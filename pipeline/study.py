@@ -299,6 +299,18 @@ def _found_us(folder: Path) -> dict[str, Any] | None:
     return {"sweeps": sweeps} if sweeps else None
 
 
+def _require_signals(record: list[Path]) -> None:
+    """Refuse a WFDB header whose signals are not beside it."""
+    for header in (one for one in record if one.suffix == ".hea"):
+        lines = header.read_text(errors="replace").splitlines()
+        named = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]
+        # The first line names the record: as name/n where n segments have headers of their own.
+        files = named[1:] if named and "/" not in named[0] else []
+        missing = [name for name in files if not (header.parent / name).exists()]
+        if missing:
+            raise InputError(f"{header}: names {missing[0]}, which is not beside it; copy it there")
+
+
 def _require_nothing_in(us: Path) -> None:
     """Refuse files that a user took for sweeps, and that nothing would read."""
     others = [one for one in _files(us) if not one.name.startswith(".")]
@@ -342,6 +354,7 @@ def _require_files(study: Study) -> None:
     for stem in (study.ecg.mr, study.ecg.us):
         if stem is not None and not _record_files(stem):
             raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
+        _require_signals([one for one in _record_files(stem) if stem and one.stem == stem.stem])
     if study.us and study.ecg.us is None:
         raise InputError(
             f"{study.folder}: has tracked ultrasound but no ECG recorded with it; add ecg/us.hea "

@@ -138,6 +138,21 @@ def test_a_wfdb_record_is_all_its_files_however_it_is_named(tmp_path: Path, endi
     assert [path.name for path in files] == ["mr.dat", "mr.hea"]
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_signals_that_a_wfdb_header_names_are_looked_for(tmp_path: Path, there: bool) -> None:
+    folder = study_folder(tmp_path)
+    header = (
+        "# by hand\nus 2 500 1000\nother.dat 16 200 16 0 0 0 0 I\nother.dat 16 200 16 0 0 0 0 II\n"
+    )
+    (folder / "ecg" / "us.hea").write_text(header)
+    if there:
+        (folder / "ecg" / "other.dat").touch()
+        assert open_study(folder).ecg.us == folder / "ecg" / "us"
+    else:
+        with pytest.raises(InputError, match=r"us\.hea: names other\.dat, which is not beside it"):
+            open_study(folder)
+
+
 @pytest.mark.parametrize("name", ["us/sweep.nrrd", "us/left/sweep.mha", "us/sweep.MHA"])
 def test_ultrasound_that_is_not_found_is_not_taken_for_none(tmp_path: Path, name: str) -> None:
     folder = study_folder(tmp_path, us=False)

@@ -219,15 +219,31 @@ def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
 
 
 def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
+    needed = (
+        f'needs "trigger_times_ms" as {slices} lists of {phases} numbers (or one list) and '
+        f'"rr_ms" as {slices} numbers (or one)'
+    )
     try:
         content = json.loads(path.read_text())
-        triggers = np.asarray(content["trigger_times_ms"], dtype=float)
-        rr_ms = np.asarray(content["rr_ms"], dtype=float)
-        triggers = np.broadcast_to(triggers, (slices, phases))
-        rr_ms = np.broadcast_to(rr_ms, (slices,))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f'{path}: needs "trigger_times_ms" as {slices} lists of {phases} numbers (or one '
-            f'list) and "rr_ms" as {slices} numbers (or one): {error!r}'
-        ) from error
-    return triggers, rr_ms
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+    if not isinstance(content, dict) or not {"trigger_times_ms", "rr_ms"} <= set(content):
+        found = ", ".join(content) if isinstance(content, dict) else repr(content)
+        raise InputError(f"{path}: {needed}; it holds {found or 'nothing'}")
+    given = []
+    for key, shape in (("trigger_times_ms", (slices, phases)), ("rr_ms", (slices,))):
+        try:
+            numbers = np.asarray(content[key], dtype=float)
+            given.append(np.broadcast_to(numbers, shape))
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{path}: {needed}; {key} is {_in_words(content[key])}") from error
+    return given[0], given[1]
+
+
+def _in_words(value: Any) -> str:
+    """The shape of what stands where numbers should."""
+    if not isinstance(value, list):
+        return repr(value)
+    inner = {len(one) for one in value if isinstance(one, list)}
+    of = f" of {' or '.join(map(str, sorted(inner)))}" if inner else ""
+    return f"a list of {len(value)}" + (f" lists{of}" if inner else "")
