@@ -34,6 +34,10 @@ class Outcome:
     lv_ejection_fraction: float | None
     target_registration_error_mm: float | None
     largest_distance_error_mm: float | None
+    expected_tre_mm: float | None
+    registration: str
+    """Its verdict; empty where there is none."""
+
     cause: str
 
 
@@ -79,7 +83,7 @@ def run_batch(
 def _no_studies(studies: Path, folders: Sequence[Path], out: Path) -> list[Outcome]:
     others = (path for path in studies.iterdir() if path.is_dir() and path not in folders)
     return [
-        Outcome(path.name, NO_STUDY, 0.0, None, None, None, "has neither cine/ nor study.yaml")
+        Outcome(path.name, NO_STUDY, 0.0, *_figures({}), "has neither cine/ nor study.yaml")
         for path in others
         if not path.name.startswith(".") and path.resolve() != out.resolve()
     ]
@@ -103,14 +107,20 @@ def _require_different_patients(folders: Sequence[Path]) -> None:
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """The outcomes as text, one line a patient."""
-    lines = [f"{'patient':24s} {'status':8s} {'seconds':>8s} {'LV EF':>6s} {'TRE mm':>7s}  cause"]
+    head = f"{'patient':24s} {'status':8s} {'seconds':>8s} {'LV EF':>6s} {'TRE mm':>7s}"
+    lines = [f"{head} {'expected':>8s}  {'verdict':8s}  cause"]
     for one in outcomes:
-        fraction = "-" if one.lv_ejection_fraction is None else f"{one.lv_ejection_fraction:.2f}"
-        error = one.target_registration_error_mm
-        error_text = "-" if error is None else f"{error:.2f}"
+        figures = (
+            f"{'-' if value is None else format(value, '.2f'):>{width}s}"
+            for value, width in (
+                (one.lv_ejection_fraction, 6),
+                (one.target_registration_error_mm, 7),
+                (one.expected_tre_mm, 8),
+            )
+        )
         lines.append(
-            f"{one.patient:24s} {one.status:8s} {one.seconds:8.1f} {fraction:>6s} "
-            f"{error_text:>7s}  {one.cause}"
+            f"{one.patient:24s} {one.status:8s} {one.seconds:8.1f} {' '.join(figures)}  "
+            f"{one.registration or '-':8s}  {one.cause}"
         )
     return "\n".join(lines)
 
@@ -148,17 +158,22 @@ def _stages(out: Path, study: Path) -> dict[str, Any]:
     return stages
 
 
-def _figures(stages: dict[str, Any]) -> tuple[float | None, float | None, float | None]:
+def _figures(
+    stages: dict[str, Any],
+) -> tuple[float | None, float | None, float | None, float | None, str]:
     def figure(stage: str, *keys: str) -> float | None:
         value = stages.get(stage, {}).get("figures", {})
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         return value if isinstance(value, float) else None
 
+    verdict = stages.get("register", {}).get("figures", {}).get("verdict", "")
     return (
         figure("surface", "lv_ejection_fraction"),
         figure("evaluate", "target_registration_error_mm"),
         figure("bake", "accuracy", "distance_error_max_mm"),
+        figure("register", "expected_tre_mm"),
+        verdict,
     )
 
 

@@ -24,6 +24,7 @@ if study.name == "crashes":
 if study.name == "raises":
     raise RuntimeError("a bug")
 figures = {"surface": {"figures": {"lv_ejection_fraction": 0.61}},
+           "register": {"figures": {"verdict": "doubtful", "expected_tre_mm": 2.125}},
            "evaluate": {"figures": {"target_registration_error_mm": 1.25}}}
 (out / study.name).mkdir()
 (out / study.name / "run.json").write_text(json.dumps({"stages": figures}))
@@ -63,6 +64,8 @@ def test_each_patient_ends_alone_and_the_table_says_how(
     assert "RuntimeError: a bug" in rows["raises"]["cause"]
     assert rows["good"]["lv_ejection_fraction"] == "0.61"
     assert rows["well"]["target_registration_error_mm"] == "1.25"
+    assert (rows["well"]["registration"], rows["well"]["expected_tre_mm"]) == ("doubtful", "2.125")
+    assert rows["fails"]["registration"] == ""
     printed = capsys.readouterr().out
     for name, row in rows.items():
         assert name in printed
