@@ -7,6 +7,7 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -368,6 +369,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(command: Callable[[], Any]) -> int:
     try:
         code = command()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except CycloptsError:
         return 2
     except BeatfieldError as error:

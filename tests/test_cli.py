@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -241,3 +242,14 @@ def test_the_summary_says_what_the_registration_is_worth(
     assert "verdict" not in summary(record, tmp_path)
     stage.update(status="skipped", cause="no tracked ultrasound", figures={})
     assert "verdict" not in summary(record, tmp_path)
+
+
+def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
+    """As `beatfield ... | head -1` does, here with a pipe that nobody reads."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    script = "import sys; from pipeline.cli import _guarded; sys.exit(_guarded(lambda: print(1)))"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")

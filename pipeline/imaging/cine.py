@@ -26,6 +26,9 @@ from pipeline.imaging.spacing import fill_gaps, regular_steps
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
 
+LEAST_OF_A_BEAT = 0.1
+"""From the first phase to the last; end-diastole and end-systole alone are a quarter apart."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cine:
@@ -126,8 +129,8 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     Raises
     ------
     InputError
-        When an RR interval is implausible, a trigger time lies outside its heartbeat, or a
-        slice is over half a phase step away from the others.
+        When an RR interval is implausible, a trigger time lies outside its heartbeat, all lie
+        within a small part of it, or a slice is over half a phase step away from the others.
     """
     low_ms, high_ms = (1000 * limit for limit in PLAUSIBLE_RR_S)
     if not ((rr_ms > low_ms) & (rr_ms < high_ms)).all():
@@ -147,6 +150,12 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     common = phases.mean(axis=0)
     if (np.diff(common) <= 0).any():
         raise InputError(f"{where}: trigger times must rise from phase to phase, got {common}")
+    if common[-1] - common[0] < LEAST_OF_A_BEAT:
+        raise InputError(
+            f"{where}: trigger times go from {trigger_times_ms.min():g} to "
+            f"{trigger_times_ms.max():g} ms, {common[-1] - common[0]:.2g} of an RR interval of "
+            f"{rr_ms.mean():g} ms; a beat's phases lie further apart: are both in milliseconds?"
+        )
     away = np.abs(phases - common).max(axis=1)
     if away.max() > 0.5 / phases.shape[1]:
         raise InputError(
