@@ -312,6 +312,8 @@ def test_pictures_repeat_to_the_byte() -> None:
         ("node_error_far_mm", 6.37693e-06, ("node error far", "6.38e-06 mm")),
         ("sign_errors", 0, ("sign errors", "0")),
         ("verdict", "good", ("verdict", "good")),
+        ("drift_max_mm", None, ("drift max", "unknown")),
+        ("force_change_max_n_per_ms", None, ("force change max", "unknown")),
     ],
 )
 def test_figures_are_shown_with_their_units_and_no_more_digits_than_they_are_worth(

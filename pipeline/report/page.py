@@ -71,6 +71,8 @@ def figure_row(name: str, value: object) -> tuple[str, str]:
     ending = next((one for one in UNITS if name.endswith(one)), "")
     text = f"{value:.3g}" if isinstance(value, float) else str(value)
     words = name.removesuffix(ending).replace("_", " ")
+    if value is None:
+        return words, "unknown"
     if ending in ("_n_per_0_1_mm", "_n_per_mm", "_n_per_ms"):
         # Figures that differ in what they are taken over alone have different names.
         words += ending[ending.index("_per_") :].replace("0_1", "0.1").replace("_", " ")

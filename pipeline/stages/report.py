@@ -193,7 +193,8 @@ def _field(job: Job, shown: Moments) -> Section:
         "The potential over an MR slice, lines of equal distance every 5 mm (the surface is bold) "
         "and arrows of force. Of the certificate: p99 is what 99 places in 100 keep under; sign "
         "errors are places taken for the wrong side; drift is how far the surface lies off halfway "
-        "between two phases; the band is what lies within it of the surface. A device has to "
+        "between two phases (unknown where there are two phases only: how it goes from one to the "
+        "other is then a guess); the band is what lies within it of the surface. A device has to "
         "render the fixture's stiffness, which is below its limit; what is measured exceeds it at "
         "single places beside a medial axis, where two parts of the surface are equally near, and "
         "where the force changes with place as fast as the grid's spacing allows.",
