@@ -189,6 +189,11 @@ def describe_validation(
             message = f"unknown key; {_instead(one['loc'], model)}"
         elif one["type"] == "model_type" and (below := _keys(_at(one["loc"], model))):
             message = f"needs keys below it ({', '.join(below)})"
+        elif one["type"].startswith("union_tag"):
+            kind = one["ctx"]["discriminator"].strip("'")
+            given = f", got {one['ctx']['tag']!r}" if "tag" in one["ctx"] else ""
+            known = one["ctx"].get("expected_tags", "")
+            message = f"needs `{kind}:`, one of {known}{given}" if known else f"needs `{kind}:`"
         elif one["type"] == "string_type" and isinstance(one["input"], int | float):
             message = "needs text; put it in quotes"
         came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"

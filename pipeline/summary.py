@@ -24,6 +24,7 @@ def summary(record: dict[str, Any], products: Path) -> str:
     ]
     seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
     lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
+    lines += _orientation(record["stages"].get("segment", {}))
     lines += _verdict(record["stages"].get("register", {}))
     bake = record["stages"].get("bake", {})
     example = bake.get("figures", {}).get("example")
@@ -39,6 +40,14 @@ def summary(record: dict[str, Any], products: Path) -> str:
         stale = record["stages"].get("report", {}).get("status") == "stale"
         lines.append(f"report    {page}" + (" (stale: `beatfield run` renews it)" if stale else ""))
     return "\n".join(lines)
+
+
+def _orientation(segment: dict[str, Any]) -> list[str]:
+    """A line where the heart lies otherwise than the file says."""
+    orientation = segment.get("figures", {}).get("orientation", "")
+    if not orientation.startswith("other") or segment["status"] == "stale":
+        return []
+    return [f"heart     lies {orientation}; check the file's orientation and order of slices"]
 
 
 def _verdict(register: dict[str, Any]) -> list[str]:

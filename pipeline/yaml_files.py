@@ -38,5 +38,7 @@ def read_yaml(path: Path) -> Any:
     try:
         with path.open("rb") as stream:
             return yaml.load(stream, _Loader)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
     except (yaml.YAMLError, OSError) as error:
         raise InputError(f"{path}: cannot be read as YAML ({error})") from error

@@ -86,6 +86,7 @@ def test_a_wrong_command_ends_with_exit_code_2(
         ),
         ("bake: {structures: [aorta, lung]}", "bake.structures.1: no structure 'lung'"),
         ("bake: {spacing_mm: wide}", "bake.spacing_mm"),
+        ("bake: {spacing_mm: 200}", "bake.spacing_mm: Input should be less than or equal to 20"),
         ("bake: [1, 2]", "bake"),
         ("fixtures: {}", "at least one fixture"),
         (
@@ -242,6 +243,13 @@ def test_the_summary_says_what_the_registration_is_worth(
     assert "verdict" not in summary(record, tmp_path)
     stage.update(status="skipped", cause="no tracked ultrasound", figures={})
     assert "verdict" not in summary(record, tmp_path)
+
+
+@pytest.mark.parametrize("orientation", ["as the file says", "other than the file says: mirrored"])
+def test_the_summary_says_when_a_heart_lies_otherwise(tmp_path: Path, orientation: str) -> None:
+    stage = {"status": "done", "figures": {"orientation": orientation}}
+    said = summary({"status": "done", "stages": {"segment": stage}}, tmp_path)
+    assert ("lies other than the file says: mirrored;" in said) == orientation.startswith("other")
 
 
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:

@@ -109,7 +109,8 @@ def test_samples_spread_evenly_over_area():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("shape: spoon\n", "spoon"),
+        ("shape: spoon\n", "needs `shape:`, one of 'needle', .*, got 'spoon'"),
+        ("radius_mm: 3\n", "needs `shape:`"),
         ("shape: needle\nlength_mm: -3\n", "length_mm"),
         ("shape: needle\nlength_mm: 3\ncolour: red\n", "colour"),
         ("shape: [\n", "cannot be read"),

@@ -222,3 +222,5 @@ class TestVerdict:
     def test_settings_refuse_bounds_that_cross(self):
         with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):
             RegisterSettings(good_tre_mm=3, worst_tre_mm=2)
+        with pytest.raises(ValueError, match=r"(?s)seed.*greater than or equal to 0"):
+            RegisterSettings(seed=-1)

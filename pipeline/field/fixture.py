@@ -211,7 +211,7 @@ class Bounds(Section):
 class BakeSettings(Section):
     """How surfaces become grids."""
 
-    spacing_mm: float = Field(default=1.5, gt=0)
+    spacing_mm: float = Field(default=1.5, ge=0.05, le=20)
     """Distance between grid nodes, the same on every axis."""
 
     margin_mm: float = Field(default=15.0, ge=15)

@@ -150,11 +150,21 @@ class FieldMetadata(Part):
         return [part.path for part in parts] + fixtures + [part.spline for part in parts]
 
 
+LEAST_PHASE_STEP = 1e-3
+"""Of a cycle; phases nearer than that are a unit mistaken."""
+
+
 def require_phases(phases: list[float], where: str) -> None:
     """Raise ValueError unless phases rise within [0, 1)."""
     inside = all(0 <= phase < 1 for phase in phases)
     if not phases or not inside or any(b <= a for a, b in itertools.pairwise(phases)):
         raise ValueError(f"{where} must rise within [0, 1), got {phases}")
+    gaps = [b - a for a, b in itertools.pairwise([*phases, phases[0] + 1])]
+    if min(gaps) < LEAST_PHASE_STEP:
+        raise ValueError(
+            f"{where} lie {min(gaps):.2g} of a cycle apart, at least {LEAST_PHASE_STEP:g} is "
+            f"needed; they are shares of a cycle, not seconds; got {phases}"
+        )
 
 
 def require_name(name: str, what: str) -> None:

@@ -91,7 +91,8 @@ def _read(path: Path) -> Any:
         return pydicom.dcmread(path)
     except (InvalidDicomError, EOFError, ValueError, KeyError) as error:
         raise InputError(
-            f"{path}: cannot be read as DICOM ({error}); copy it again from the scanner"
+            f"{path}: is not DICOM, or damaged; copy it again from the scanner, or take it out of "
+            f"the folder where it does not belong there ({str(error).partition('. Use ')[0]})"
         ) from error
 
 

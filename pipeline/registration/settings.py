@@ -68,7 +68,7 @@ class RegisterSettings(BaseModel):
     on_failure: Literal["stop", "mr_frame"] = "stop"
     """What happens to a study that cannot be registered: the stage fails, or the field is made in
     the frame of the MR."""
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     """Of the poses that are tried around the start."""
 
     @model_validator(mode="after")

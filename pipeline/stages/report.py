@@ -11,6 +11,7 @@ from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.nifti import read_image
 from pipeline.imaging.ultrasound import read_sweep
+from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.publish import sealed
@@ -110,6 +111,12 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
 
 def _notes(job: Job) -> list[str]:
     notes = []
+    orientation = figures_of(job, "segment")["orientation"]
+    if orientation != str(AS_THE_FILE_SAYS):
+        notes.append(
+            f"The heart lies {orientation}. All products are in the file's frame: check the order "
+            "of the slices and the orientation in the file before a field is used with a tracker."
+        )
     missing = figures_of(job, "ingest")["interpolated_slices"]
     if missing:
         named = ", ".join(str(number) for number in missing)
