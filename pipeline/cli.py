@@ -30,6 +30,8 @@ app = App(
     help=HELP,
     help_format="plaintext",
     result_action="return_value",
+    # Said by `_guarded`, in the program's own words.
+    suppress_keyboard_interrupt=False,
 )
 
 Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]

@@ -252,6 +252,17 @@ def test_the_summary_says_when_a_heart_lies_otherwise(tmp_path: Path, orientatio
     assert ("lies other than the file says: mirrored;" in said) == orientation.startswith("other")
 
 
+def test_an_interruption_says_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.cli._run", interrupted)
+    assert main(["run", str(tmp_path), "--out", str(tmp_path / "out")]) == 130
+    assert "interrupted; finished stages are kept" in capsys.readouterr().err
+
+
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
     """As `beatfield ... | head -1` does, here with a pipe that nobody reads."""
     reading, writing = os.pipe()

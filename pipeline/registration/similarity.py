@@ -12,7 +12,7 @@ Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -101,16 +101,7 @@ def expansion(
     pushes, squares = np.zeros((frames, 3, 6)), np.zeros((frames, 6, 6))
     with_trend = np.zeros((frames, 6, samples.trend.shape[1]))
     bend(
-        samples.points_mm,
-        samples.grey,
-        samples.trend,
-        samples.trend_row,
-        samples.first,
-        place.lower,
-        place.weight,
-        tissue.share,
-        place.index_from_tracker,
-        place.shift,
+        *_looked_at(samples, tissue, place),
         fit.coefficients.astype(np.float32),
         np.array(tissue.grid.spacing_mm),
         (np.asarray(centre_mm) - tissue.grid.origin_mm) / tissue.grid.spacing_mm,
@@ -171,10 +162,9 @@ class _Fit:
     """``(frames, 2, columns)`` of blood and wall."""
 
 
-def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
-    sums = np.zeros((samples.frames, SUMS))
-    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
-    add_up(
+def _looked_at(samples: Samples, tissue: TissueMap, place: _Place) -> tuple[Any, ...]:
+    """What both kernels need of the frames and the model, in their order."""
+    return (
         samples.points_mm,
         samples.grey,
         samples.trend,
@@ -185,9 +175,13 @@ def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
         tissue.share,
         place.index_from_tracker,
         place.shift,
-        sums,
-        with_trend,
     )
+
+
+def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
+    sums = np.zeros((samples.frames, SUMS))
+    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
+    add_up(*_looked_at(samples, tissue, place), sums, with_trend)
     return _explained(sums, with_trend, np.diff(samples.first))
 
 
