@@ -87,6 +87,10 @@ def alter(name: str, value: Any, at: int = 2) -> Change:
         (lambda data, number, phase: (number, phase) != (1, 2), "missing phase: slice 1"),
         (alter("Rows", 4), "different matrices"),
         (alter("PixelSpacing", [2.0, 2.0]), "different pixel spacing"),
+        (
+            alter("ImageOrientationPatient", [1, 0, 0, 0, 0, -1]),
+            "missing slice.*; not taken: .* not parallel",
+        ),
         (alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()), "different spacing"),
         (drop("TriggerTime"), "no trigger time"),
         (drop("NominalInterval"), "no RR interval"),

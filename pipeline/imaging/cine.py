@@ -104,7 +104,12 @@ def stack_frames(
     _require_timing(chosen)
     slices, time_name = _in_time(_slices_in_order(chosen), where)
     _require_complete(slices, where)
-    step_mm, numbers = regular_steps(slices, where, fill)
+    lines = left_out_lines([*left_out, *others], where)
+    try:
+        step_mm, numbers = regular_steps(slices, where, fill)
+    except InputError as error:
+        # A slice that is missed may be there, and be none of the stack for a reason.
+        raise InputError("; not taken: ".join([str(error), *lines])) from error
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
     phases = common_phases(triggers, rr_ms, where)
@@ -112,7 +117,6 @@ def stack_frames(
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
-    lines = left_out_lines([*left_out, *others], where)
     return Stack(cine, triggers, rr_ms, source, lines)
 
 
@@ -149,7 +153,11 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
         )
     common = phases.mean(axis=0)
     if (np.diff(common) <= 0).any():
-        raise InputError(f"{where}: trigger times must rise from phase to phase, got {common}")
+        raise InputError(
+            f"{where}: trigger times must rise from phase to phase, they are "
+            f"{trigger_times_ms.mean(axis=0).round(1).tolist()} ms (mean of the slices); put the "
+            "phases in the order of time"
+        )
     if common[-1] - common[0] < LEAST_OF_A_BEAT:
         raise InputError(
             f"{where}: trigger times go from {trigger_times_ms.min():g} to "

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import StageError
+from pipeline.errors import InputError, StageError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, read_sweep
@@ -82,7 +82,10 @@ def _registered(
 def _r_times_s(job: Job) -> Float:
     assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
     ecg = read_ecg(job.study.ecg.us)
-    return detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz) + ecg.start_s
+    try:
+        return detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz) + ecg.start_s
+    except InputError as error:
+        raise InputError(f"{job.study.ecg.us}: {error}") from error
 
 
 def _rows(sweeps: list[Sweep], phases: list[Float], found: Registration) -> list[FrameRow]:
