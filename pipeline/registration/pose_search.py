@@ -137,7 +137,7 @@ def climb(landscape: Landscape, pose: Float, pivot: Pivot, within_mm: float = 0.
             break
         damped = here.bending + damping * mean * np.eye(6)
         step_mm = -np.linalg.solve(damped, here.slopes.sum(axis=0))
-        step_mm *= min(1.0, _LONGEST_MM / np.abs(step_mm).max())
+        step_mm *= _LONGEST_MM / max(_LONGEST_MM, np.abs(step_mm).max())
         moved = pivot.move(pose, step_mm)
         there = landscape.expansion(moved, pivot)
         if there.losses.sum() < here.losses.sum():
