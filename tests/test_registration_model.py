@@ -189,8 +189,9 @@ def level(recording, tissue_map):
 
 
 class TestExpansion:
-    @pytest.mark.parametrize("seed", range(3))
-    @pytest.mark.parametrize("case", ["as it is", "bright blood", "breath"])
+    @pytest.mark.parametrize(
+        ("seed", "case"), [(0, "as it is"), (1, "bright blood"), (2, "breath")]
+    )
     def test_slopes_add_up_to_the_way_the_losses_go(self, recording, level, pivot, seed, case):
         """Their integral along a way of 3 mm in each parameter, by the midpoint rule: straight
         lines between nodes leave kinks in the losses, which differences would stumble over."""
