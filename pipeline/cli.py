@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -373,9 +374,11 @@ def _guarded(command: Callable[[], Any]) -> int:
         code = command()
         sys.stdout.flush()
     except BrokenPipeError:
-        # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell. What
+        # was to be done may not be: the exit code is that of programs which this signal ends.
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return 128 + signal.SIGPIPE
     except CycloptsError:
         return 2
     except BeatfieldError as error:
