@@ -12,8 +12,8 @@ from pipeline.errors import InputError
 from pipeline.field.fixture import DEFAULT_FIXTURES, BakeSettings, Fixture
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.registration.settings import RegisterSettings
-from pipeline.study import describe_validation
 from pipeline.surface.settings import SurfaceSettings
+from pipeline.validation import describe_validation
 from pipeline.yaml_files import read_yaml
 
 

@@ -23,7 +23,7 @@ from pipeline.field.fixture import BakeSettings, Bounds, Fixture
 from pipeline.field.reader import ForceField
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
-from pipeline.study import describe_validation
+from pipeline.validation import describe_validation
 
 Row = tuple[float, float, float, float]
 Transform = tuple[Row, Row, Row, Row]

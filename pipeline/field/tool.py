@@ -180,7 +180,7 @@ def read_tool(path: Path | str) -> Tool:
     InputError
         When either cannot be read, or a key or value is wrong.
     """
-    from pipeline.study import describe_validation
+    from pipeline.validation import describe_validation
     from pipeline.yaml_files import read_yaml
 
     path = Path(path)

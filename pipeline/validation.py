@@ -1,0 +1,82 @@
+"""What is wrong with what a user wrote, key by key, in words."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+
+def describe_validation(
+    error: ValidationError, where: str, model: type[BaseModel] | None = None
+) -> str:
+    """A validation error as lines that name the file, the key, and what came.
+
+    With the ``model`` that was to be filled, an unknown key is answered with the nearest known, and
+    with the sections that have a key of this name.
+    """
+    lines = []
+    for one in error.errors():
+        key = ".".join(str(part) for part in one["loc"]) or "(all)"
+        message = one["msg"].removeprefix("Value error, ")
+        if one["type"] == "extra_forbidden":
+            message = f"unknown key; {_instead(one['loc'], model)}"
+        elif one["type"] == "model_type" and (below := _keys(_at(one["loc"], model))):
+            message = f"needs keys below it ({', '.join(below)})"
+        elif one["type"].startswith("union_tag"):
+            kind = one["ctx"]["discriminator"].strip("'")
+            given = f", got {one['ctx']['tag']!r}" if "tag" in one["ctx"] else ""
+            known = one["ctx"].get("expected_tags", "")
+            message = f"needs `{kind}:`, one of {known}{given}" if known else f"needs `{kind}:`"
+        elif one["type"] == "string_type" and isinstance(one["input"], int | float):
+            message = "needs text; put it in quotes"
+        came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
+        lines.append(f"{where}: {key}: {message}{came}")
+    return "\n".join(lines)
+
+
+def _instead(place: tuple[int | str, ...], model: type[BaseModel] | None) -> str:
+    """What to do about an unknown key."""
+    key = str(place[-1])
+    homes = " or ".join(_homes(key, model))
+    # A name that is known elsewhere is hardly misspelt: only a close likeness is then named too.
+    near = get_close_matches(key, _keys(_at(place[:-1], model)), 1, 0.7 if homes else 0.6)
+    said = [f"it belongs {homes}"] if homes else []
+    said += [f"did you mean {near[0]}?"] if near else []
+    return ", or ".join(said) or "check its spelling"
+
+
+def _homes(key: str, model: Any, section: str = "") -> list[str]:
+    """Where a model and those within it have such a key."""
+    known = _keys(model)
+    homes = [f"under {section}" if section else "at the top level"] if key in known else []
+    for name in known:
+        inner, place = _within(model, name), f"{section}.{name}" if section else name
+        if get_origin(inner) is dict:
+            inner, place = _within(inner, "NAME"), f"{place}.NAME"
+        homes += _homes(key, inner, place)
+    return homes
+
+
+def _keys(model: Any) -> dict[str, Any]:
+    """Annotations of a model's fields, by the keys under which they are given."""
+    if not (isinstance(model, type) and issubclass(model, BaseModel)):
+        return {}
+    return {one.alias or name: one.annotation for name, one in model.model_fields.items()}
+
+
+def _at(place: tuple[int | str, ...], model: Any) -> Any:
+    """The model at a place within a model, or None."""
+    for part in place:
+        model = _within(model, part)
+    return model
+
+
+def _within(known: Any, key: int | str) -> Any:
+    """The model under one key of a model or of a mapping, or None."""
+    if get_origin(known) is dict:
+        return get_args(known)[1]
+    inner = _keys(known).get(str(key))
+    kinds = [one for one in get_args(inner) if isinstance(one, type)]
+    return kinds[0] if type(None) in kinds else inner
