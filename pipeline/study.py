@@ -233,7 +233,10 @@ def _found_us(folder: Path) -> dict[str, Any] | None:
 def _require_signals(record: list[Path]) -> None:
     """Refuse a WFDB header whose signals are not beside it."""
     for header in (one for one in record if one.suffix == ".hea"):
-        lines = header.read_text(errors="replace").splitlines()
+        try:
+            lines = header.read_text(errors="replace").splitlines()
+        except OSError as error:
+            raise InputError(f"{header}: cannot be read ({error})") from error
         named = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]
         # The first line names the record: as name/n where n segments have headers of their own.
         files = named[1:] if named and "/" not in named[0] else []

@@ -177,7 +177,7 @@ def chance_below(covariance: Float, centre_mm: Float, points_mm: Float, limit_mm
     values, vectors = np.linalg.eigh(covariance)
     error = draws @ (vectors * np.sqrt(np.maximum(values, 0))).T
     arm = np.asarray(points_mm, float) - centre_mm
-    # (shift + turn x arm) of every draw at every point, a few points at a time.
+    # Point by point: all draws at all points at once would take a gigabyte.
     total = np.zeros(_DRAWS)
     for one in arm:
         total += np.linalg.norm(error[:, :3] + np.cross(error[:, 3:], one), axis=1)
