@@ -16,8 +16,10 @@ from pipeline.surface.level_set import (
     smooth_level_set,
     smooth_union,
     volume_shift,
+    with_necks,
     with_sign_of,
 )
+from pipeline.surface.mesh import extract_surface
 
 
 def ball(radius_voxels: float, offset: tuple[float, float, float] = (0, 0, 0)):
@@ -150,3 +152,48 @@ def test_mended_distances_have_the_sign_of_the_mask():
     distance = np.array([-2.0, 3.0, 4.0, -1.0], np.float32)
     found = with_sign_of(distance, np.array([True, True, False, False]), 2.0)
     np.testing.assert_array_equal(found, [-2.0, -0.5, 4.0, 0.5])
+
+
+@pytest.mark.parametrize("length", [3, 7])
+def test_a_neck_thinner_than_the_smoothing_is_kept(length):
+    """Two balls joined by a row of single voxels: smoothing parts them, the tube joins them."""
+    first, _ = ball(6)
+    second, _ = ball(4)
+    room = (second.shape[0] - 7) // 2
+    small = second[room:-room, room:-room, room:-room]
+    mask = np.pad(first, ((0, 0), (0, 0), (0, 2 * length + 20)))
+    middle, begin = mask.shape[0] // 2, int(np.flatnonzero(mask.any(axis=(0, 1)))[-1]) + 1
+    mask[middle, middle, begin : begin + length] = True
+    side = small.shape[0]
+    around = slice(middle - side // 2, middle - side // 2 + side)
+    mask[around, around, begin + length : begin + length + side] |= small
+    level = smooth_level_set(mask, SPACING_MM, 1.5)
+    assert ndimage.label(level.distance_mm < 0)[1] == 2
+
+    kept = with_necks(level, mask, 1.8, 60)
+
+    assert ndimage.label(kept.distance_mm < 0)[1] == 1
+    # Marching cubes of 2 mm triangles sees one closed body, whose hole count is a ball's.
+    surface = extract_surface(kept, 2.0)
+    assert len(surface.vertices_mm) - len(surface.triangles) / 2 == 2
+    assert np.ptp(surface.vertices_mm[:, 0]) > SPACING_MM * (12 + length + 6)
+    # Elsewhere the surface is where it was: 8 mm from the row no tube is felt.
+    row = np.zeros_like(mask)
+    row[middle, middle, begin : begin + length] = True
+    far = ndimage.distance_transform_edt(~row) * SPACING_MM > 8
+    far &= np.abs(level.distance_mm) < SPACING_MM
+    np.testing.assert_allclose(kept.distance_mm[far], level.distance_mm[far], atol=1e-3)
+
+
+def test_necks_leave_alone_what_is_in_one_piece():
+    mask, _ = ball(6)
+    level = smooth_level_set(mask, SPACING_MM, 1.5)
+    assert with_necks(level, mask, 1.8, 60) is level
+
+
+def test_specks_are_not_joined():
+    mask, _ = ball(6)
+    mask[2:4, 2:4, 2:4] = True
+    level = smooth_level_set(mask, SPACING_MM, 0.5)
+    assert ndimage.label(level.distance_mm < 0)[1] == 2
+    assert with_necks(level, mask, 1.8, 60) is level

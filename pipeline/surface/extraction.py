@@ -26,6 +26,7 @@ from pipeline.surface.level_set import (
     enclosed_mm3,
     smooth_level_set,
     smooth_union,
+    with_necks,
     with_sign_of,
 )
 from pipeline.surface.mesh import bad_triangles, extract_surface, uncrossed, untangled
@@ -54,6 +55,9 @@ FEWEST_VOXELS = 60
 MARGIN_VOXELS = 8
 # Tries at one heart of parts that lie apart; wider seams would change the shape all over.
 BLEND_WIDENINGS = (1.0, 1.5, 2.0)
+
+# Radius of a neck, in edges of triangles, that marching cubes is sure to find.
+NECK_EDGES = 0.9
 
 Progress = Callable[[int, int], None]
 # Tries at a mesh that passes through itself.
@@ -145,7 +149,7 @@ def extract(
     tell = progress or (lambda done, total: None)
 
     def carry(name: str) -> _Followed:
-        body = _body(heart, name, spacing_mm, settings.smoothing_voxels)
+        body = _body(heart, name, spacing_mm, settings)
         return _carried(name, body, phases, settings)
 
     def finish(name: str) -> _Followed:
@@ -220,7 +224,7 @@ def _solid(volume: Label, name: str) -> Mask:
     return np.asarray(chosen[volume])
 
 
-def _body(heart: Label, name: str, spacing_mm: float, smoothing_voxels: float) -> Body:
+def _body(heart: Label, name: str, spacing_mm: float, settings: SurfaceSettings) -> Body:
     """Cut a structure out, make each phase one solid piece, and smooth it."""
     solid = np.stack([_solid(volume, name) for volume in heart])
     seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
@@ -228,8 +232,13 @@ def _body(heart: Label, name: str, spacing_mm: float, smoothing_voxels: float) -
     cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     padded = np.pad(cut, [(0, 0)] + [(MARGIN_VOXELS, MARGIN_VOXELS)] * 3)
     masks = [one_piece(mask) for mask in padded]
+
+    def smooth(mask: Mask) -> LevelSet:
+        level = smooth_level_set(mask, spacing_mm, settings.smoothing_voxels)
+        return with_necks(level, mask, NECK_EDGES * settings.edge_mm, FEWEST_VOXELS)
+
     return Body(
-        tuple(smooth_level_set(mask, spacing_mm, smoothing_voxels) for mask in masks),
+        tuple(smooth(mask) for mask in masks),
         tuple(float(np.count_nonzero(mask)) * spacing_mm**3 for mask in masks),
         (low - MARGIN_VOXELS)[::-1],
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import SimpleITK as sitk
-from scipy import ndimage, special
+from scipy import ndimage, spatial, special
 
 from pipeline.geometry import Float, Float32, Mask
 from pipeline.surface.kernels import sample
@@ -65,6 +65,55 @@ def smooth_level_set(mask: Mask, spacing_mm: float, smoothing_voxels: float) -> 
     distance = 2 * distance - ndimage.gaussian_filter(distance, smoothing_voxels, truncate=4.0)
     distance -= volume_shift(distance, float(np.count_nonzero(mask)))
     return LevelSet((distance * spacing_mm).astype(np.float32), spacing_mm)
+
+
+def with_necks(level: LevelSet, mask: Mask, radius_mm: float, fewest_voxels: int) -> LevelSet:
+    """The level set with those necks kept that are thinner than the smoothing.
+
+    Smoothing may part a mask of one piece where it is a voxel or two thin, as an auricle's neck.
+    Parts of ``fewest_voxels`` or more are joined again to the largest by a tube along the shortest
+    way through the mask.
+
+    Parameters
+    ----------
+    level
+        What `smooth_level_set` made of ``mask``.
+    mask
+        ``(z, y, x)``, one piece.
+    radius_mm
+        Of the tubes.
+    """
+    # Imported where few need it, for it takes a while.
+    from skimage.graph import MCP_Geometric
+
+    pieces, count = ndimage.label(level.distance_mm < 0)
+    sizes = np.bincount(pieces.ravel())[1:]
+    if count < 2 or np.sort(sizes)[-2] < fewest_voxels:
+        return level
+    body = int(sizes.argmax()) + 1
+    inside = mask | (pieces == body)
+    ways = MCP_Geometric(np.where(inside, 1 + np.maximum(level.distance_mm, 0), np.inf))
+    costs, _ = ways.find_costs(np.argwhere(pieces == body))
+    distance_mm = level.distance_mm
+    for number in np.flatnonzero(sizes >= fewest_voxels) + 1:
+        ends = np.argwhere((pieces == number) & np.isfinite(costs))
+        if number == body or not len(ends):
+            continue
+        nearest = ends[costs[tuple(ends.T)].argmin()]
+        way = ndimage.gaussian_filter1d(
+            np.array(ways.traceback(nearest), float), 1.0, axis=0, mode="nearest"
+        )
+        tube_mm = _away_mm(way, distance_mm.shape, level.spacing_mm) - radius_mm
+        distance_mm = smooth_union([distance_mm, tube_mm], level.spacing_mm)
+    return LevelSet(distance_mm, level.spacing_mm)
+
+
+def _away_mm(way: Float, shape: tuple[int, ...], spacing_mm: float) -> Float32:
+    """Distance of every voxel from the points ``(n, 3)`` of a way, in index coordinates."""
+    grid = np.indices(shape).reshape(3, -1).T
+    steps = np.concatenate([way, (way[1:] + way[:-1]) / 2])
+    away = np.asarray(spatial.cKDTree(steps).query(grid)[0])
+    return np.asarray(spacing_mm * away.reshape(shape), np.float32)
 
 
 def volume_shift(distance_voxels: Float, volume_voxels: float) -> float:
