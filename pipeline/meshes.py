@@ -53,20 +53,48 @@ def read_mesh(path: Path) -> Surface:
 
 
 def require_whole(path: Path) -> None:
-    """Refuse a PLY file that ends before what its header promises: VTK's reader would crash.
+    """Refuse a file that ends too soon: VTK's readers would crash on it or say pages about it.
 
     Raises
     ------
     InputError
-        When it does, or has no header.
+        When it does, or a PLY file has no header.
     """
-    if path.suffix.lower() != ".ply":
+    checks = {".ply": _require_whole_ply, ".stl": _require_whole_stl, ".vtp": _require_whole_vtp}
+    check = checks.get(path.suffix.lower())
+    if check is None:
         return
     try:
-        head, found, body = path.read_bytes().partition(b"end_header")
+        check(path, path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+
+
+def _require_whole_vtp(path: Path, content: bytes) -> None:
+    if not content.rstrip().endswith(b"</VTKFile>"):
+        raise InputError(f"{path}: is cut off: it does not end with </VTKFile>; copy it again")
+
+
+def _require_whole_stl(path: Path, content: bytes) -> None:
+    """A binary file says how many triangles follow its head of 84 bytes, 50 bytes each; one in
+    text, which begins with ``solid`` as some binary ones do, ends with a line ``endsolid``."""
+    promised = 84 + 50 * int.from_bytes(content[80:84], "little")
+    if content.lstrip()[:5].lower() == b"solid" and len(content) != promised:
+        if b"endsolid" not in content[-1000:].lower():
+            raise InputError(f"{path}: is cut off: it has no line endsolid; copy it again")
+    elif len(content) < max(promised, 84):
+        raise InputError(
+            f"{path}: is cut off: it has {len(content)} bytes, its head promises {promised}; "
+            "copy it again"
+        )
+
+
+def _require_whole_ply(path: Path, content: bytes) -> None:
+    try:
+        head, found, body = content.partition(b"end_header")
         lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
         least = _least_size(lines, any(line[:2] == ["format", "ascii"] for line in lines))
-    except (OSError, KeyError, ValueError, IndexError) as error:
+    except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"{path}: cannot be read as a PLY file ({error})") from error
     if not found:
         raise InputError(f"{path}: is no whole PLY file: its header does not end; copy it again")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline import __version__
 from pipeline.config import Settings
-from pipeline.errors import InputError
+from pipeline.errors import InputError, StageError
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
@@ -23,6 +23,7 @@ from pipeline.field.fixture import BakeSettings, Bounds, Fixture
 from pipeline.field.reader import ForceField
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
+from pipeline.surface.crossings import crossing_triangles
 from pipeline.validation import describe_validation
 
 Row = tuple[float, float, float, float]
@@ -75,6 +76,9 @@ def bake_own_surfaces(
     ------
     InputError
         When a file cannot be used, a fixture's surface is missing, or ``out`` not written.
+    StageError
+        When the field is out of its bounds, with the place where a surface crosses itself if one
+        does.
     """
     own = read_own_surfaces(folder)
     field = out / "field.zarr"
@@ -82,17 +86,36 @@ def bake_own_surfaces(
     with only_run_in(out), publishing(field) as partial:
         # The store makes its own folder.
         partial.rmdir()
-        bake_field(
-            partial,
-            own.surfaces,
-            _fixtures_for(own.surfaces, settings),
-            settings.bake,
-            mr_from_tracker=None if transform is None else np.array(transform),
-            rr_s=own.timing.rr_s,
-            source={"surfaces": own.digests, "beatfield": __version__},
-            progress=progress,
-        )
+        try:
+            bake_field(
+                partial,
+                own.surfaces,
+                _fixtures_for(own.surfaces, settings),
+                settings.bake,
+                mr_from_tracker=None if transform is None else np.array(transform),
+                rr_s=own.timing.rr_s,
+                source={"surfaces": own.digests, "beatfield": __version__},
+                progress=progress,
+            )
+        except StageError as error:
+            raise StageError(_with_crossings(str(error), own.surfaces)) from error
     return field
+
+
+def _with_crossings(message: str, surfaces: Mapping[str, SurfaceSeries]) -> str:
+    """Why a field failed, and where a surface passes through itself: that leaves no inside."""
+    for name, series in surfaces.items():
+        for phase, surface in enumerate(series.surfaces):
+            crossing = crossing_triangles(surface.vertices_mm, surface.triangles)
+            if crossing.any():
+                place_mm = surface.vertices_mm[surface.triangles[crossing.argmax()]].mean(axis=0)
+                x, y, z = (f"{one:.1f}" for one in place_mm)
+                return (
+                    f"{message}. But {name} passes through itself in phase {phase} ("
+                    f"{np.count_nonzero(crossing)} triangles, one at {x} {y} {z} mm), so that no "
+                    "spacing will do: unite its parts, or remesh it"
+                )
+    return message
 
 
 def measure_field(

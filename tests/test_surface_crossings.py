@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from field_shapes import sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from surface_shapes import crossing_triangles as independent
 from surface_shapes import ellipsoid, voxel_centres
 
+from pipeline.config import Settings
+from pipeline.errors import StageError
+from pipeline.field import BakeSettings
 from pipeline.geometry import Float, Surface
+from pipeline.meshes import write_vtp
+from pipeline.own_surfaces import bake_own_surfaces
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.level_set import LevelSet, smooth_level_set
 from pipeline.surface.mesh import adjacency, extract_surface, uncrossed
@@ -96,3 +104,21 @@ def test_a_vertex_pushed_through_the_other_side_is_found_and_mended():
 def test_a_sound_mesh_is_returned_as_it_is():
     surface, level = thin_body()
     assert uncrossed(surface.vertices_mm, surface.triangles, level) is surface.vertices_mm
+
+
+def test_a_bake_that_fails_names_the_surface_that_passes_through_itself(tmp_path: Path) -> None:
+    """Two balls that overlap: inside both, no distance has the sign of the outer face."""
+    one, other = sphere(15, 3), sphere(15, 3, (18, 0.3, 0.7))
+    both = Surface(
+        np.concatenate([one.vertices_mm, other.vertices_mm]),
+        np.concatenate([one.triangles, other.triangles + len(one.vertices_mm)]),
+    )
+    folder = tmp_path / "own"
+    folder.mkdir()
+    write_vtp(folder / "lv.vtp", both)
+    # They meet half-way, at x = 9 mm, to within a triangle's size and the tilt of that plane.
+    with pytest.raises(
+        StageError, match=r"lv passes through itself in phase 0 .* at ([789]|1[01])\."
+    ):
+        bake_own_surfaces(folder, tmp_path / "out", Settings(bake=BakeSettings(spacing_mm=3.0)))
+    assert not (tmp_path / "out" / "field.zarr").exists()
