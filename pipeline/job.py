@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from pipeline.publish import sealed
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on the settings of other stages.
@@ -36,3 +38,10 @@ class Job:
         """The folder of a finished stage, or None where it was skipped."""
         path = self.products / stage
         return path if path.is_dir() else None
+
+    def figures(self, stage: str) -> dict[str, Any]:
+        """What a finished stage measured."""
+        content = sealed(self.products / stage)
+        assert content is not None, f"{stage} is finished before this stage begins"
+        figures: dict[str, Any] = content["figures"]
+        return figures

@@ -72,7 +72,7 @@ def require_whole(path: Path) -> None:
 
 def _require_whole_vtp(path: Path, content: bytes) -> None:
     if not content.rstrip().endswith(b"</VTKFile>"):
-        raise InputError(f"{path}: is cut off: it does not end with </VTKFile>; copy it again")
+        raise InputError(f"{path}: is no whole VTP file: it does not end with </VTKFile>")
 
 
 def _require_whole_stl(path: Path, content: bytes) -> None:
@@ -81,11 +81,11 @@ def _require_whole_stl(path: Path, content: bytes) -> None:
     promised = 84 + 50 * int.from_bytes(content[80:84], "little")
     if content.lstrip()[:5].lower() == b"solid" and len(content) != promised:
         if b"endsolid" not in content[-1000:].lower():
-            raise InputError(f"{path}: is cut off: it has no line endsolid; copy it again")
+            raise InputError(f"{path}: is no whole STL file: no line endsolid; copy it again")
     elif len(content) < max(promised, 84):
         raise InputError(
-            f"{path}: is cut off: it has {len(content)} bytes, its head promises {promised}; "
-            "copy it again"
+            f"{path}: is no whole STL file: it has {len(content)} bytes, its head promises "
+            f"{max(promised, 84)}; copy it again"
         )
 
 

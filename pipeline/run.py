@@ -60,7 +60,6 @@ STAGES = (
         "report",
         after=("ingest", "segment", "surface", "register", "bake", "evaluate"),
         inputs=("us",),
-        settings=("fixtures",),
     ),
 )
 

@@ -25,6 +25,7 @@ def summary(record: dict[str, Any], products: Path) -> str:
     seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
     lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
     lines += _orientation(record["stages"].get("segment", {}))
+    lines += _left_out(record["stages"])
     lines += _verdict(record["stages"].get("register", {}))
     bake = record["stages"].get("bake", {})
     example = bake.get("figures", {}).get("example")
@@ -48,6 +49,29 @@ def _orientation(segment: dict[str, Any]) -> list[str]:
     if not orientation.startswith("other") or segment["status"] == "stale":
         return []
     return [f"heart     lies {orientation}; check the file's orientation and order of slices"]
+
+
+def _left_out(stages: dict[str, Any]) -> list[str]:
+    """A line for each surface and default fixture that this study's images do not give."""
+    lines = []
+    for stage, what in (("surface", "surface"), ("bake", "fixture")):
+        if stages.get(stage, {}).get("status") != "stale":
+            left_out = stages.get(stage, {}).get("figures", {}).get("left_out", {})
+            for why, names in by_reason(left_out).items():
+                lines.append(f"left out  {what} {', '.join(names)}: {why}")
+    return lines
+
+
+def by_reason(left_out: dict[str, str]) -> dict[str, list[str]]:
+    """Names that share a reason, by reason.
+
+    >>> by_reason({"aorta": "unseen", "left_atrium": "unseen"})
+    {'unseen': ['aorta', 'left_atrium']}
+    """
+    names: dict[str, list[str]] = {}
+    for name, why in left_out.items():
+        names.setdefault(why, []).append(name)
+    return names
 
 
 def _verdict(register: dict[str, Any]) -> list[str]:

@@ -158,9 +158,9 @@ def wrong_meshes(folder: Path) -> None:
     [
         ("none.stl", "no such mesh"),
         ("folder.stl", "no such mesh"),
-        ("cut.stl", "cannot be read as a tool's mesh"),
-        ("cut.vtp", "cannot be read as a tool's mesh"),
-        ("text.stl", "cannot be read as a tool's mesh"),
+        ("cut.stl", "is no whole STL file"),
+        ("cut.vtp", "is no whole VTP file"),
+        ("text.stl", "is no whole STL file"),
         ("text.obj", "holds no triangles"),
         ("text.txt", "cannot be read as a tool's mesh"),
         ("line.vtp", "holds no triangles"),

@@ -24,6 +24,8 @@ from scipy.ndimage import correlate1d
 
 from pipeline.field import ForceField
 from pipeline.geometry import Float
+from pipeline.imaging.nifti import write_image
+from pipeline.products import read_cine
 
 PHASES = 5
 
@@ -272,6 +274,37 @@ def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(work: Path, produ
     # The same heart as the DICOM study's, so the same bytes from here on.
     name = "surface/lv_endocardium_003.vtp"
     assert (found / name).read_bytes() == (products / name).read_bytes()
+
+
+def test_a_stack_that_ends_at_the_valves_is_baked_without_atria(work: Path, products: Path) -> None:
+    """End-diastole and end-systole of the ventricles alone, as research sets have them."""
+    cine = read_cine(products / "ingest")
+    study = work / "short" / "patient-0001"
+    (study / "cine").mkdir(parents=True)
+    images = np.ascontiguousarray(cine.intensity[:2, :7])
+    write_image(study / "cine" / "cine.nii.gz", images, cine.mr_from_index)
+    times_ms = (1000 * cine.rr_s * cine.phases[:2]).tolist()
+    timing = {"trigger_times_ms": times_ms, "rr_ms": 1000 * cine.rr_s}
+    (study / "cine" / "timing.json").write_text(json.dumps(timing))
+
+    run = ["run", study, "--out", work / "ventricles", "--config", work / "run.yaml"]
+    said = done(*run)
+
+    assert "left out  surface left_atrium, right_atrium, aorta: no phase shows it" in said
+    assert "left out  fixture left_atrium_guidance: needs left_atrium" in said
+    found = work / "ventricles" / "patient-0001"
+    field = ForceField.open(found / "bake" / "field.zarr")
+    assert set(field.fixtures) == {"epicardium_guidance", "left_ventricle_forbidden"}
+    assert "No surface of left atrium" in (found / "report" / "index.html").read_text()
+
+    # What a user asks for by name is not left out: the bake fails and says why.
+    one = "atrium: {structure: left_atrium, kind: guidance, gamma_mm: 3, m: 2, f_max_n: 2}"
+    (work / "atrium.yaml").write_text(f"fixtures:\n  {one}\n")
+    failed = beatfield(*run[:-1], work / "atrium.yaml")
+    assert failed.returncode == 2
+    assert "fixture atrium needs left_atrium, which has no surface: no phase shows it" in (
+        failed.stderr
+    )
 
 
 def test_a_users_own_surfaces_bake_the_same_field(work: Path, products: Path) -> None:

@@ -223,6 +223,16 @@ def test_a_slice_spoilt_in_all_phases_is_doubted():
     assert slice_confidence(cine, found, drawn(found))[:, 4].max() < 0.5
 
 
+def test_an_end_of_the_stack_that_resembles_nothing_is_doubted_half_as_much():
+    """At the tip of a large heart muscle and fat follow on a bright cavity."""
+    cine, found = beating()
+    z = found.view.order[0]
+    before = slice_confidence(cine, found, drawn(found))
+    cine.intensity[:, z] *= -1
+    after = slice_confidence(cine, found, drawn(found))
+    np.testing.assert_allclose(after[:, 0], before[:, 0] / 2, rtol=0.02)
+
+
 def test_a_heart_that_jumps_for_one_phase_is_doubted():
     cine, found = beating()
     found.value[2, 2] = np.roll(found.value[2, 2], (20, 24), (1, 2))

@@ -168,6 +168,6 @@ def test_a_mesh_file_that_is_cut_off_is_refused(
     content = whole.read_bytes()
     cut.write_bytes(content[: round(left * len(content))])
     capfd.readouterr()
-    with pytest.raises(InputError, match=r"cut\.\w+: is (cut off: |no whole PLY file)"):
+    with pytest.raises(InputError, match=r"cut\.\w+: is (cut off|no whole)"):
         read_mesh(cut)
     assert capfd.readouterr().err == ""

@@ -71,7 +71,11 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     step = neighbour_steps(found.view.slice_step_mm)
     if step * found.view.slice_step_mm > FARTHEST_MM:
         return confidence
-    confidence *= _ramp(_best_in_space(images, step), ALIKE_IN_SPACE)
+    alike = _ramp(_best_in_space(images, step), ALIKE_IN_SPACE)
+    # At an end there is one neighbour alone, and a slice that grazes the tip resembles nothing.
+    alike[:, :step] = (1 + alike[:, :step]) / 2
+    alike[:, -step:] = (1 + alike[:, -step:]) / 2
+    confidence *= alike
     overlap = _best_overlap_in_space(heart, step)
     return np.asarray(confidence * np.where(large, _ramp(overlap, OVERLAP), 1))
 

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline import __version__
+from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
+from pipeline.field.fixture import Fixture
 from pipeline.geometry import MovingSurface
 from pipeline.job import Job
 from pipeline.products import read_surfaces, read_table
+
+if TYPE_CHECKING:
+    from pipeline.config import Settings
 
 
 def run(job: Job) -> dict[str, Any]:
     """Write ``field.zarr``; its accuracy certificate is the stage's figures."""
     timing = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(timing["phases"]))
+    lost = job.figures("surface")["left_out"]
+    fixtures, left_out = fixtures_for(job.settings, surfaces, lost)
     registered = job.product("register")
     mr_from_tracker = None
     if registered:
@@ -26,19 +33,59 @@ def run(job: Job) -> dict[str, Any]:
     certificate = bake_field(
         job.folder / "field.zarr",
         surfaces,
-        job.settings.fixtures,
+        fixtures,
         job.settings.bake,
         mr_from_tracker=mr_from_tracker,
         rr_s=timing["rr_s"],
         source={"patient_id": job.study.patient_id, "beatfield": __version__},
         progress=job.progress,
     )
-    return {"accuracy": certificate, "example": _example(job, surfaces)}
+    return {
+        "accuracy": certificate,
+        "example": _example(fixtures, surfaces),
+        "left_out": left_out,
+    }
 
 
-def _example(job: Job, surfaces: Mapping[str, MovingSurface]) -> dict[str, Any]:
+def fixtures_for(
+    settings: Settings, surfaces: Collection[str], lost: Mapping[str, str]
+) -> tuple[dict[str, Fixture], dict[str, str]]:
+    """The fixtures to bake, and those that a study's images do not allow, with the reason.
+
+    A default fixture is left out where its surface is missing; one that the user asked for is not.
+
+    Parameters
+    ----------
+    surfaces
+        Names of those that there are.
+    lost
+        Those that there are not, and why.
+
+    Raises
+    ------
+    InputError
+        When a surface that the user asked for is missing.
+    """
+    kept = {name: one for name, one in settings.fixtures.items() if one.structure in surfaces}
+    missing = {
+        name: f"needs {one.structure}, which has no surface"
+        for name, one in settings.fixtures.items()
+        if name not in kept
+    }
+    if missing and "fixtures" in settings.model_fields_set:
+        said = "; ".join(
+            f"fixture {name} {needs}: {lost[settings.fixtures[name].structure]}"
+            for name, needs in missing.items()
+        )
+        raise InputError(f"{said}; change the fixture's structure, or take the fixture out")
+    return kept, missing
+
+
+def _example(
+    fixtures: Mapping[str, Fixture], surfaces: Mapping[str, MovingSurface]
+) -> dict[str, Any]:
     """A place to ask for a force: just off the first fixture's surface at the first phase."""
-    name, fixture = next(iter(job.settings.fixtures.items()))
+    name, fixture = next(iter(fixtures.items()))
     moving = surfaces[fixture.structure]
     vertices_mm = moving.vertices_mm[0]
     centre_mm = vertices_mm.mean(axis=0)

@@ -14,7 +14,6 @@ from pipeline.imaging.ultrasound import read_sweep
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
-from pipeline.publish import sealed
 from pipeline.registration.correction import put_right
 from pipeline.registration.uncertainty import expected_tre_mm
 from pipeline.report import certainty, certificate, heart, pictures
@@ -22,6 +21,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
+from pipeline.summary import by_reason
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -76,17 +76,9 @@ def _confidence(job: Job) -> tuple[Float, float]:
     return np.array(said["confidence"], dtype=float), low
 
 
-def figures_of(job: Job, stage: str) -> dict[str, Any]:
-    """What a finished stage measured."""
-    content = sealed(job.products / stage)
-    assert content is not None, f"{stage} is finished before the report begins"
-    figures: dict[str, Any] = content["figures"]
-    return figures
-
-
 def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tuple[str, str]]:
-    ingest = figures_of(job, "ingest")
-    accuracy = figures_of(job, "bake")["accuracy"]
+    ingest = job.figures("ingest")
+    accuracy = job.figures("bake")["accuracy"]
     rows = [
         (
             "cine",
@@ -97,7 +89,7 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
         ("lowest confidence of the labels", lowest_place(confidence)),
     ]
     if job.product("register"):
-        register = figures_of(job, "register")
+        register = job.figures("register")
         rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
         said = [register["verdict"], register["reason"], register["calibration"]]
         rows.append(("registration", "; ".join(filter(None, said))))
@@ -111,16 +103,20 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
 
 def _notes(job: Job) -> list[str]:
     notes = []
-    orientation = figures_of(job, "segment")["orientation"]
+    orientation = job.figures("segment")["orientation"]
     if orientation != str(AS_THE_FILE_SAYS):
         notes.append(
             f"The heart lies {orientation}. All products are in the file's frame: check the order "
             "of the slices and the orientation in the file before a field is used with a tracker."
         )
-    missing = figures_of(job, "ingest")["interpolated_slices"]
+    missing = job.figures("ingest")["interpolated_slices"]
     if missing:
         named = ", ".join(str(number) for number in missing)
         notes.append(f"Not recorded, so drawn between their neighbours: slices {named}.")
+    for why, names in by_reason(job.figures("surface")["left_out"]).items():
+        notes.append(f"No surface of {', '.join(names).replace('_', ' ')}: {why}.")
+    for name, why in job.figures("bake")["left_out"].items():
+        notes.append(f"Left out: the default fixture {name}, which {why}.")
     if not job.product("register"):
         notes.append("No tracked ultrasound: the field is in the frame of the MR.")
     if not job.product("evaluate"):
@@ -178,7 +174,7 @@ def _field(job: Job, shown: Moments) -> Section:
     field = ForceField.open(job.products / "bake" / "field.zarr")
     name = next(iter(field.fixtures))
     figure = pictures.potential_on_slice(shown, field, name)
-    profiles = pictures.fixture_profiles(job.settings.fixtures)
+    profiles = pictures.fixture_profiles(field.fixtures)
     rows = [
         (
             fixture_name,
@@ -191,7 +187,7 @@ def _field(job: Job, shown: Moments) -> Section:
             f"{fixture.stiffness_n_per_m:.0f}",
             fixture.device,
         )
-        for fixture_name, fixture in job.settings.fixtures.items()
+        for fixture_name, fixture in field.fixtures.items()
     ]
     head = ["fixture", "surface", "kind", "gamma mm", "delta mm", "m"]
     head += ["most force N", "stiffness N/m", "device"]
@@ -209,7 +205,7 @@ def _field(job: Job, shown: Moments) -> Section:
             picture("Potential, distance and force", as_png(figure), "png"),
             picture("Force of each fixture", as_svg(profiles), "svg"),
         ],
-        [Table(head, rows), *certificate.tables(figures_of(job, "bake")["accuracy"])],
+        [Table(head, rows), *certificate.tables(job.figures("bake")["accuracy"])],
     )
 
 
@@ -247,5 +243,5 @@ def _against_truth(name: str, one: dict[str, Any]) -> list[str]:
 
 
 def _example(job: Job) -> dict[str, Any]:
-    example: dict[str, Any] = figures_of(job, "bake")["example"]
+    example: dict[str, Any] = job.figures("bake")["example"]
     return example

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import InputError, StageError
-from pipeline.geometry import Float, Float32, Integer, Label, Mask, MovingSurface, transform_points
+from pipeline.geometry import Float, Integer, Label, MovingSurface, transform_points
 from pipeline.imaging.labels import LABELS
+from pipeline.surface.bodies import FEWEST_VOXELS, Body, cut_out, joined
 from pipeline.surface.correspondence import (
     Across,
     carry_along,
@@ -21,17 +22,8 @@ from pipeline.surface.correspondence import (
 )
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.decimation import decimated
-from pipeline.surface.level_set import (
-    LevelSet,
-    enclosed_mm3,
-    smooth_level_set,
-    smooth_union,
-    with_necks,
-    with_sign_of,
-)
 from pipeline.surface.mesh import bad_triangles, extract_surface, uncrossed, untangled
 from pipeline.surface.settings import SurfaceSettings
-from pipeline.surface.solid import largest_piece, one_piece
 from pipeline.surface.unfolding import make_unfolder
 
 STRUCTURES: dict[str, tuple[str, ...]] = {
@@ -49,35 +41,12 @@ GROWN_ON = dict.fromkeys(("left_atrium", "right_atrium", "aorta"), ("epicardium"
 """Structures that slide with others where they touch them."""
 
 REQUIRED_STRUCTURES = ("lv_endocardium", "epicardium")
-# A body below this many voxels is gone after smoothing.
-FEWEST_VOXELS = 60
-# Voxels of room round a body: as far as a distance is still of use.
-MARGIN_VOXELS = 8
-# Tries at one heart of parts that lie apart; wider seams would change the shape all over.
-BLEND_WIDENINGS = (1.0, 1.5, 2.0)
-
-# Radius of a neck, in edges of triangles, that marching cubes is sure to find.
-NECK_EDGES = 0.9
 
 Progress = Callable[[int, int], None]
 # Tries at a mesh that passes through itself.
 UNCROSSINGS = 4
 # The interpreter lock leaves nothing for more.
 THREADS = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """One structure in every phase, cut out of the grid with room round it."""
-
-    levels: tuple[LevelSet, ...]
-    """Smooth signed distance, one a phase."""
-
-    volumes_mm3: tuple[float, ...]
-    """Volume by the labels, one a phase."""
-
-    first_index: Integer
-    """Index ``(x, y, z)`` of the first voxel in the grid; negative where the body is padded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +71,9 @@ class Extraction:
 
     crossing_triangles: dict[str, int]
     """How many triangles of each, over all phases, still pass through others; 0 as it should be."""
+
+    left_out: dict[str, str]
+    """Structures that have no surface, and why."""
 
 
 def extract(
@@ -131,26 +103,30 @@ def extract(
     Returns
     -------
     Extraction
-        A structure that no phase shows at a usable size (a short stack may miss the aorta) is left
-        out; the left ventricle never is.
+        A structure is left out where no phase or not every one shows it at a usable size (a stack
+        that ends at the valves reaches the atria only while the ventricles are short), or it
+        cannot be followed through the beat; the left ventricle never is.
 
     Raises
     ------
     InputError
         When shapes disagree, phases do not rise, or the grid is not isotropic.
     StageError
-        When the left ventricle is missing, a structure is there in some phases only, its shape
-        in some phase has nothing to do with its shape at the reference phase, or the parts of the
-        heart lie far apart.
+        When the left ventricle is missing in some phase, or its shape there has nothing to do with
+        its shape at the reference phase.
     """
     spacing_mm = _require_grid(heart, mr_from_index, phases)
-    counts = _label_counts(heart)
-    parts = [name for name in STRUCTURES if name != "heart" and _is_present(counts, name, phases)]
+    absent = _absent(_label_counts(heart), phases)
+    parts = [name for name in STRUCTURES if name != "heart" and name not in absent]
     tell = progress or (lambda done, total: None)
 
-    def carry(name: str) -> _Followed:
-        body = _body(heart, name, spacing_mm, settings)
-        return _carried(name, body, phases, settings)
+    def carry(name: str) -> _Followed | StageError:
+        try:
+            return _carried(
+                cut_out(heart, STRUCTURES[name], spacing_mm, settings), phases, settings
+            )
+        except StageError as error:
+            return error
 
     def finish(name: str) -> _Followed:
         grown_on = [carried[other] for other in GROWN_ON.get(name, ()) if other in carried]
@@ -158,20 +134,29 @@ def extract(
 
     followed: dict[str, _Followed] = {}
     with ThreadPoolExecutor(THREADS) as pool:
-        carried = dict(zip(parts, pool.map(carry, parts), strict=True))
-        for name, one in zip(parts, pool.map(finish, parts), strict=True):
+        tried = dict(zip(parts, pool.map(carry, parts), strict=True))
+        carried = {name: one for name, one in tried.items() if isinstance(one, _Followed)}
+        lost = {name: one for name, one in tried.items() if isinstance(one, StageError)}
+        for name in REQUIRED_STRUCTURES:
+            if name in lost:
+                raise StageError(f"{name}: {lost[name]}") from lost[name]
+        for name, one in zip(carried, pool.map(finish, carried), strict=True):
             followed[name] = one
-            tell(len(followed), len(parts) + 1)
+            tell(len(followed), len(carried) + 1)
         outer = [one for name, one in followed.items() if name != "lv_endocardium"]
-        followed["heart"] = _follow_heart(outer, phases, settings, pool.map)
+        try:
+            followed["heart"] = _follow_heart(outer, phases, settings, pool.map)
+        except StageError as error:
+            lost["heart"] = error
         placed = [_placed(one, mr_from_index) for one in followed.values()]
         fewer = pool.map(lambda one: decimated(one, settings.decimation_error_mm), placed)
         surfaces = dict(zip(followed, fewer, strict=True))
-    tell(len(followed), len(followed))
+    tell(len(carried) + 1, len(carried) + 1)
     return Extraction(
         surfaces,
         {name: one.mended_phases for name, one in followed.items()},
         {name: one.crossing_triangles for name, one in followed.items()},
+        absent | {name: str(one) for name, one in lost.items()},
     )
 
 
@@ -200,110 +185,38 @@ def _label_counts(heart: Label) -> Integer:
     return np.stack([np.bincount(volume.ravel(), minlength=256) for volume in heart])
 
 
-def _is_present(label_counts: Integer, name: str, phases: Float) -> bool:
-    """Whether a structure is there in all phases; StageError if in some, or if it must be."""
-    for label in STRUCTURES[name] if name in REQUIRED_STRUCTURES else ():
+def _absent(label_counts: Integer, phases: Float) -> dict[str, str]:
+    """Structures that are not there in all phases, and where; StageError for one that must be."""
+    absent = {}
+    for name in STRUCTURES:
+        counts = label_counts[:, [LABELS[label] for label in STRUCTURES[name]]].sum(axis=1)
+        short, k = counts < FEWEST_VOXELS, int(counts.argmin())
+        few = f"in phase {k} (at {phases[k]:.3f} of the beat) {counts[k]} voxels show it"
+        if name in REQUIRED_STRUCTURES:
+            _require_seen(label_counts, name)
+            if short.any():
+                raise StageError(
+                    f"{name}: {few}, {FEWEST_VOXELS} or more are needed; look at the labels of "
+                    "that phase"
+                )
+        elif short.all():
+            absent[name] = "no phase shows it"
+        elif short.any():
+            absent[name] = f"not every phase shows it: {few}, {FEWEST_VOXELS} or more are needed"
+    return absent
+
+
+def _require_seen(label_counts: Integer, name: str) -> None:
+    for label in STRUCTURES[name]:
         if not label_counts[:, LABELS[label]].any():
             raise StageError(f"segmentation shows no {label} in any phase; look at its labels")
-    counts = label_counts[:, [LABELS[label] for label in STRUCTURES[name]]].sum(axis=1)
-    if (counts < FEWEST_VOXELS).all() and name not in REQUIRED_STRUCTURES:
-        return False
-    if (counts < FEWEST_VOXELS).any():
-        k = int(counts.argmin())
-        raise StageError(
-            f"{name}: phase {k} (at {phases[k]:.3f} of the beat) has {counts[k]} voxels, "
-            f"{FEWEST_VOXELS} or more are needed; look at the labels of that phase"
-        )
-    return True
 
 
-def _solid(volume: Label, name: str) -> Mask:
-    """Where one phase shows a structure."""
-    chosen = np.zeros(256, dtype=bool)
-    chosen[[LABELS[label] for label in STRUCTURES[name]]] = True
-    return np.asarray(chosen[volume])
-
-
-def _body(heart: Label, name: str, spacing_mm: float, settings: SurfaceSettings) -> Body:
-    """Cut a structure out, make each phase one solid piece, and smooth it."""
-    solid = np.stack([_solid(volume, name) for volume in heart])
-    seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
-    low, high = np.array([(lines[0], lines[-1] + 1) for lines in seen]).T
-    cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    padded = np.pad(cut, [(0, 0)] + [(MARGIN_VOXELS, MARGIN_VOXELS)] * 3)
-    masks = [one_piece(mask) for mask in padded]
-
-    def smooth(mask: Mask) -> LevelSet:
-        level = smooth_level_set(mask, spacing_mm, settings.smoothing_voxels)
-        return with_necks(level, mask, NECK_EDGES * settings.edge_mm, FEWEST_VOXELS)
-
-    return Body(
-        tuple(smooth(mask) for mask in masks),
-        tuple(float(np.count_nonzero(mask)) * spacing_mm**3 for mask in masks),
-        (low - MARGIN_VOXELS)[::-1],
-    )
-
-
-def _joined(bodies: Sequence[Body], blend_mm: float, phases: Float, across: Across) -> Body:
-    """Bodies taken together, the seams between them bridged, as widely as one piece needs."""
-    spacing_mm = bodies[0].levels[0].spacing_mm
-    first = np.min([body.first_index for body in bodies], axis=0)
-    for widening in BLEND_WIDENINGS:
-        unions = _unions(bodies, first, widening * blend_mm, across)
-        broken = [k for k, union in enumerate(unions) if _is_in_pieces(union < 0)]
-        if not broken:
-            break
-    else:
-        k = broken[0]
-        raise StageError(
-            f"heart: its parts lie in pieces in phase {k} (at {phases[k]:.3f} of the beat), too "
-            f"far apart for seams of {blend_mm} mm to bridge; look at the labels of that phase"
-        )
-
-    def mended(k: int) -> Float32:
-        return with_sign_of(unions[k], one_piece(unions[k] < 0), spacing_mm)
-
-    levels = tuple(LevelSet(union, spacing_mm) for union in across(mended, range(len(unions))))
-    return Body(levels, tuple(enclosed_mm3(level) for level in levels), first)
-
-
-def _unions(
-    bodies: Sequence[Body], first: Integer, blend_mm: float, across: Across
-) -> list[Float32]:
-    """Smooth union of the bodies in an array that holds them all, one a phase."""
-    ends = [body.first_index + body.levels[0].distance_mm.shape[::-1] for body in bodies]
-    shape = np.max(ends, axis=0) - first
-
-    def union(k: int) -> Float32:
-        placed = [_in_room(body.levels[k], body.first_index - first, shape) for body in bodies]
-        return smooth_union(placed, blend_mm)
-
-    return list(across(union, range(len(bodies[0].levels))))
-
-
-def _is_in_pieces(mask: Mask) -> bool:
-    """Whether a piece that is more than a speck lies apart from the largest."""
-    return int(np.count_nonzero(mask & ~largest_piece(mask))) >= FEWEST_VOXELS
-
-
-def _in_room(level: LevelSet, corner: Integer, shape: Integer) -> Float32:
-    """Distances of a body in a larger array; ``corner`` and ``shape`` are ``(x, y, z)``."""
-    far_mm = MARGIN_VOXELS * level.spacing_mm
-    room = np.full(tuple(shape[::-1]), far_mm, dtype=np.float32)
-    ends = corner + level.distance_mm.shape[::-1]
-    x, y, z = (slice(start, end) for start, end in zip(corner, ends, strict=True))
-    room[z, y, x] = level.distance_mm
-    return room
-
-
-def _carried(name: str, body: Body, phases: Float, settings: SurfaceSettings) -> _Followed:
-    """One structure's surface through the beat by its own shape; StageError names the structure."""
+def _carried(body: Body, phases: Float, settings: SurfaceSettings) -> _Followed:
+    """One structure's surface through the beat by its own shape."""
     reference = _reference(phases, settings)
-    try:
-        template = extract_surface(body.levels[reference], settings.edge_mm)
-        path = carry_through_cycle(template, body.levels, reference, phases)
-    except StageError as error:
-        raise StageError(f"{name}: {error}") from error
+    template = extract_surface(body.levels[reference], settings.edge_mm)
+    path = carry_through_cycle(template, body.levels, reference, phases)
     return _Followed(body, MovingSurface(path, template.triangles, phases))
 
 
@@ -335,14 +248,11 @@ def _follow_heart(
     parts: Sequence[_Followed], phases: Float, settings: SurfaceSettings, across: Across
 ) -> _Followed:
     """The outer surface of all parts, which goes where they go."""
-    body = _joined([part.body for part in parts], settings.heart_blend_mm, phases, across)
+    body = joined([part.body for part in parts], settings.heart_blend_mm, phases, across)
     reference = _reference(phases, settings)
     within_mm = _vertices_in(body, parts)
-    try:
-        template = extract_surface(body.levels[reference], settings.edge_mm)
-        path = carry_along(template, body.levels, reference, phases, within_mm, across)
-    except StageError as error:
-        raise StageError(f"heart: {error}") from error
+    template = extract_surface(body.levels[reference], settings.edge_mm)
+    path = carry_along(template, body.levels, reference, phases, within_mm, across)
     carried = _Followed(body, MovingSurface(path, template.triangles, phases))
     return _finished(carried, phases, settings, across)
 

@@ -1,0 +1,128 @@
+"""Bodies cut out of labels: one structure in every phase as smooth signed distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import StageError
+from pipeline.geometry import Float, Float32, Integer, Label, Mask
+from pipeline.imaging.labels import LABELS
+from pipeline.surface.correspondence import Across
+from pipeline.surface.level_set import (
+    LevelSet,
+    enclosed_mm3,
+    smooth_level_set,
+    smooth_union,
+    with_necks,
+    with_sign_of,
+)
+from pipeline.surface.settings import SurfaceSettings
+from pipeline.surface.solid import largest_piece, one_piece
+
+# A body below this many voxels is gone after smoothing.
+FEWEST_VOXELS = 60
+# Voxels of room round a body: as far as a distance is still of use.
+MARGIN_VOXELS = 8
+# Tries at one heart of parts that lie apart; wider seams would change the shape all over.
+BLEND_WIDENINGS = (1.0, 1.5, 2.0)
+
+# Radius of a neck, in edges of triangles, that marching cubes is sure to find.
+NECK_EDGES = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """One structure in every phase, cut out of the grid with room round it."""
+
+    levels: tuple[LevelSet, ...]
+    """Smooth signed distance, one a phase."""
+
+    volumes_mm3: tuple[float, ...]
+    """Volume by the labels, one a phase."""
+
+    first_index: Integer
+    """Index ``(x, y, z)`` of the first voxel in the grid; negative where the body is padded."""
+
+
+def _solid(volume: Label, labels: Sequence[str]) -> Mask:
+    """Where one phase shows a structure."""
+    chosen = np.zeros(256, dtype=bool)
+    chosen[[LABELS[label] for label in labels]] = True
+    return np.asarray(chosen[volume])
+
+
+def cut_out(
+    heart: Label, labels: Sequence[str], spacing_mm: float, settings: SurfaceSettings
+) -> Body:
+    """Cut a structure out, make each phase one solid piece, and smooth it."""
+    solid = np.stack([_solid(volume, labels) for volume in heart])
+    seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
+    low, high = np.array([(lines[0], lines[-1] + 1) for lines in seen]).T
+    cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]
+    padded = np.pad(cut, [(0, 0)] + [(MARGIN_VOXELS, MARGIN_VOXELS)] * 3)
+    masks = [one_piece(mask) for mask in padded]
+
+    def smooth(mask: Mask) -> LevelSet:
+        level = smooth_level_set(mask, spacing_mm, settings.smoothing_voxels)
+        return with_necks(level, mask, NECK_EDGES * settings.edge_mm, FEWEST_VOXELS)
+
+    return Body(
+        tuple(smooth(mask) for mask in masks),
+        tuple(float(np.count_nonzero(mask)) * spacing_mm**3 for mask in masks),
+        (low - MARGIN_VOXELS)[::-1],
+    )
+
+
+def joined(bodies: Sequence[Body], blend_mm: float, phases: Float, across: Across) -> Body:
+    """Bodies taken together, the seams between them bridged, as widely as one piece needs."""
+    spacing_mm = bodies[0].levels[0].spacing_mm
+    first = np.min([body.first_index for body in bodies], axis=0)
+    for widening in BLEND_WIDENINGS:
+        unions = _unions(bodies, first, widening * blend_mm, across)
+        broken = [k for k, union in enumerate(unions) if _is_in_pieces(union < 0)]
+        if not broken:
+            break
+    else:
+        k = broken[0]
+        raise StageError(
+            f"its parts lie in pieces in phase {k} (at {phases[k]:.3f} of the beat), too far apart "
+            f"for seams of {blend_mm} mm to bridge"
+        )
+
+    def mended(k: int) -> Float32:
+        return with_sign_of(unions[k], one_piece(unions[k] < 0), spacing_mm)
+
+    levels = tuple(LevelSet(union, spacing_mm) for union in across(mended, range(len(unions))))
+    return Body(levels, tuple(enclosed_mm3(level) for level in levels), first)
+
+
+def _unions(
+    bodies: Sequence[Body], first: Integer, blend_mm: float, across: Across
+) -> list[Float32]:
+    """Smooth union of the bodies in an array that holds them all, one a phase."""
+    ends = [body.first_index + body.levels[0].distance_mm.shape[::-1] for body in bodies]
+    shape = np.max(ends, axis=0) - first
+
+    def union(k: int) -> Float32:
+        placed = [_in_room(body.levels[k], body.first_index - first, shape) for body in bodies]
+        return smooth_union(placed, blend_mm)
+
+    return list(across(union, range(len(bodies[0].levels))))
+
+
+def _is_in_pieces(mask: Mask) -> bool:
+    """Whether a piece that is more than a speck lies apart from the largest."""
+    return int(np.count_nonzero(mask & ~largest_piece(mask))) >= FEWEST_VOXELS
+
+
+def _in_room(level: LevelSet, corner: Integer, shape: Integer) -> Float32:
+    """Distances of a body in a larger array; ``corner`` and ``shape`` are ``(x, y, z)``."""
+    far_mm = MARGIN_VOXELS * level.spacing_mm
+    room = np.full(tuple(shape[::-1]), far_mm, dtype=np.float32)
+    ends = corner + level.distance_mm.shape[::-1]
+    x, y, z = (slice(start, end) for start, end in zip(corner, ends, strict=True))
+    room[z, y, x] = level.distance_mm
+    return room
