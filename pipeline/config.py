@@ -73,7 +73,11 @@ def _settings(path: Path) -> Settings:
     try:
         return Settings.model_validate(sections)
     except ValidationError as error:
-        raise InputError(describe_validation(error, str(path), Settings)) from error
+        # Only to name the place of a key that belongs there.
+        from pipeline.study import Described
+
+        other = ("the study's study.yaml", Described)
+        raise InputError(describe_validation(error, str(path), Settings, other)) from error
 
 
 def _require_known_structures(settings: Settings, path: Path) -> None:

@@ -20,6 +20,7 @@ from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
+from pipeline.field.metadata import require_name
 from pipeline.field.reader import ForceField
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
@@ -253,6 +254,7 @@ def _files_by_structure(folder: Path) -> dict[str, list[Path]]:
             "STRUCTURE_001.vtp ..., one a phase"
         )
     for structure, phases in found.items():
+        require_name(structure, f"{folder}: structure")
         missing = sorted(set(range(len(phases))) - set(phases))
         if missing:
             raise InputError(

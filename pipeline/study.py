@@ -165,7 +165,11 @@ def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
     try:
         described = Described.model_validate(content)
     except ValidationError as error:
-        raise InputError(describe_validation(error, where, Described)) from error
+        # Only to name the place of a key that belongs there.
+        from pipeline.config import Settings
+
+        other = ("the configuration (--config)", Settings)
+        raise InputError(describe_validation(error, where, Described, other)) from error
     return _absolute(Study(folder=folder, **dict(described)))
 
 

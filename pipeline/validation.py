@@ -9,19 +9,23 @@ from pydantic import BaseModel, ValidationError
 
 
 def describe_validation(
-    error: ValidationError, where: str, model: type[BaseModel] | None = None
+    error: ValidationError,
+    where: str,
+    model: type[BaseModel] | None = None,
+    other: tuple[str, type[BaseModel]] | None = None,
 ) -> str:
     """A validation error as lines that name the file, the key, and what came.
 
     With the ``model`` that was to be filled, an unknown key is answered with the nearest known, and
-    with the sections that have a key of this name.
+    with the sections that have a key of this name; ``other`` is a file, in words, that may have
+    been meant, and its model.
     """
     lines = []
     for one in error.errors():
         key = ".".join(str(part) for part in one["loc"]) or "(all)"
         message = one["msg"].removeprefix("Value error, ")
         if one["type"] == "extra_forbidden":
-            message = f"unknown key; {_instead(one['loc'], model)}"
+            message = f"unknown key; {_instead(one['loc'], model, other)}"
         elif one["type"] == "model_type" and (below := _keys(_at(one["loc"], model))):
             message = f"needs keys below it ({', '.join(below)})"
         elif one["type"].startswith("union_tag"):
@@ -36,10 +40,17 @@ def describe_validation(
     return "\n".join(lines)
 
 
-def _instead(place: tuple[int | str, ...], model: type[BaseModel] | None) -> str:
+def _instead(
+    place: tuple[int | str, ...],
+    model: type[BaseModel] | None,
+    other: tuple[str, type[BaseModel]] | None,
+) -> str:
     """What to do about an unknown key."""
     key = str(place[-1])
-    homes = " or ".join(_homes(key, model))
+    found = _homes(key, model)
+    if other and not found:
+        found = [f"in {other[0]}, {home}" for home in _homes(key, other[1])]
+    homes = " or ".join(found)
     # A name that is known elsewhere is hardly misspelt: only a close likeness is then named too.
     near = get_close_matches(key, _keys(_at(place[:-1], model)), 1, 0.7 if homes else 0.6)
     said = [f"it belongs {homes}"] if homes else []

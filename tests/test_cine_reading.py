@@ -218,6 +218,15 @@ def test_a_file_of_one_phase_is_answered_with_what_to_do(tmp_path: Path) -> None
         read_nifti_cine(tmp_path / "ed.nii.gz", None)
 
 
+@pytest.mark.parametrize("shape", [(2, 40, 44, 7), (7, 40, 44, 2)])
+def test_axes_in_another_order_are_named(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    """Time or the slices first, as arrays of Python often have them."""
+    image = nibabel.Nifti1Image(np.ones(shape, np.int16), np.eye(4))
+    nibabel.save(image, tmp_path / "cine.nii.gz")
+    with pytest.raises(InputError, match=r"so 44 slices of \d columns .*\(columns, rows, slices"):
+        read_nifti_cine(tmp_path / "cine.nii.gz", None, 800)
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_voxels_in_metres_or_micrometres_are_named(tmp_path: Path, unit: float) -> None:
     nifti_cine(tmp_path / "cine.nii", np.diag([1.5 * unit, 1.5 * unit, 8 * unit, 1]))

@@ -63,6 +63,7 @@ def test_a_wrong_command_ends_with_exit_code_2(
     [
         ("bkae: {spacing_mm: 1}", "bkae: unknown key; did you mean bake?"),
         ("spacing_mm: 1", "spacing_mm: unknown key; it belongs under bake"),
+        ("rr_ms: 800", "rr_ms: unknown key; it belongs in the study's study.yaml, under cine"),
         ("bake: {grid_mm: 2}", "bake.grid_mm: unknown key; it belongs under segment"),
         ("bake: {sign_errors: 1}", "sign_errors: unknown key; it belongs under bake.bounds"),
         ("surface: {margin_mm: 1}", "it belongs under segment or under bake"),

@@ -64,6 +64,11 @@ def test_bound_holds_against_a_plain_sum(field, path, bound):
             assert np.linalg.norm(found.force_n) <= FIXTURES[name].f_max_n
 
 
+def test_a_path_is_no_tool(field):
+    with pytest.raises(InputError, match=r"read_tool\(path\), got 'needle\.yaml'"):
+        field.tool_force("needle.yaml", np.eye(4), 0.0)
+
+
 def test_a_tool_far_from_all_change_costs_next_to_nothing(field):
     """A torus in the floor of a forbidden region: a few questions, no force."""
     tool = read_tool(TOOLS[[path.stem for path in TOOLS].index("torus")])

@@ -241,6 +241,7 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("us: {sweps: [us/sweep_000.mha]}", r"us.sweps: unknown key; did you mean sweeps\?"),
         ("qwerty: 1", "qwerty: unknown key; check its spelling"),
         ("rr_ms: 800", "rr_ms: unknown key; it belongs under cine"),
+        ("breath: free", r"it belongs in the configuration \(--config\), under register"),
         ("us: {fill_gaps: true}", "us.fill_gaps: unknown key; it belongs under cine"),
         ("cine: {us: lab}", "cine.us: unknown key; it belongs at the top level or under ecg"),
         ("folder: cine", "folder: unknown key; check its spelling"),

@@ -309,7 +309,12 @@ class ForceField:
         except KeyError:
             raise self._unknown("fixture", fixture, self._laws) from None
         pose = np.ascontiguousarray(mr_from_tool, dtype=np.float64)
-        lines, found = tool.lines, np.empty(6)
+        try:
+            lines, found = tool.lines, np.empty(6)
+        except AttributeError:
+            raise InputError(
+                f"tool must be one of pipeline.field.tool, such as read_tool(path), got {tool!r}"
+            ) from None
         asked = -1
         if pose.shape == (4, 4):
             asked = kernel(

@@ -25,6 +25,9 @@ SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
 VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
 
+OBLONG = 4
+"""With more slices than this times the columns or rows, the axes are in another order."""
+
 
 def read_image(path: Path) -> tuple[npt.NDArray[Any], Float]:
     """Read a NIfTI file as ``(..., z, y, x)`` and ``mr_from_index`` in LPS millimetres.
@@ -75,6 +78,11 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
             f"{path}: is not a cine, its shape is {image.shape}; 4D is needed: if this is one of "
             "several phases, join them into one 4D file and write timing.json beside it, as "
             "docs/study.md shows"
+        )
+    if image.shape[2] > OBLONG * min(image.shape[:2]):
+        raise InputError(
+            f"{path}: its shape is {image.shape}, so {image.shape[2]} slices of {image.shape[0]} "
+            f"columns and {image.shape[1]} rows; store it as (columns, rows, slices, phases)"
         )
     intensity, mr_from_index = read_image(path)
     phase_count, slice_count = intensity.shape[:2]
