@@ -383,6 +383,8 @@ def _guarded(command: Callable[[], Any]) -> int:
         return 2
     except BeatfieldError as error:
         print(f"error: {error}", file=sys.stderr)
+        for note in getattr(error, "__notes__", ()):
+            print(f"note: {note}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("interrupted; finished stages are kept", file=sys.stderr)

@@ -149,6 +149,12 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         run.stages[stage.name] = {"status": "failed", "cause": str(error)}
         run.watcher.ended(stage.name, "failed", time.perf_counter() - clock)
         _record(run, "failed")
+        later = STAGES[STAGES.index(stage) :]
+        if old := [one.name for one in later if (run.products / one.name).is_dir()]:
+            error.add_note(
+                f"{', '.join(old)} in {run.products} came of an earlier run with other input or "
+                "settings; do not use them for this one"
+            )
         raise
     seconds = time.perf_counter() - clock
     measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}

@@ -23,6 +23,7 @@ from data_synth.population import draw_heart
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import MovingSurface
+from pipeline.registration import space
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
 from pipeline.registration.uncertainty import motion_between
@@ -85,6 +86,21 @@ class TestRegister:
         assert np.sqrt(9 / 6) * 0.5 < near < far
         assert found.verdict in ("good", "doubtful")
         assert (found.reason == "") == (found.verdict == "good")
+
+    def test_a_model_that_lacks_blood_is_less_sure_and_says_so(
+        self, surfaces, recording, monkeypatch
+    ):
+        """As a stack that ends at the valves gives it: what the atria hold looks like tissue."""
+        ventricles = {name: surfaces[name] for name in ("lv_endocardium", "rv_endocardium")}
+        strict = QUICK.model_copy(update={"good_tre_mm": 0.1, "starts": 1})
+        given = recording.sweeps, recording.phases, ventricles, recording.mr_from_tracker, strict
+        found = find(*given)
+        assert "lacks left_atrium, right_atrium, aorta" in found.reason
+        monkeypatch.setattr(space, "_LACKING", 0.0)
+        surer = find(*given)
+        np.testing.assert_array_equal(found.mr_from_tracker, surer.mr_from_tracker)
+        # The floor's variance grows by 1.6 squared, what the frames' spread adds does not.
+        assert 1 < found.expected_mm / surer.expected_mm < 1.6
 
     def test_pose_is_found_without_any_start(self, surfaces, recording):
         anywhere = QUICK.model_copy(update={"candidates_anywhere": 3000, "starts": 3})

@@ -161,6 +161,21 @@ def test_until_ends_the_run_and_marks_later_products_stale(kitchen: Kitchen) -> 
     assert statuses == {"a": "done", "b": "stale", "c": "stale"}
 
 
+def test_a_failure_tells_of_products_that_an_earlier_run_left(kitchen: Kitchen) -> None:
+    """A force server would load them, and they are not what was asked for."""
+    kitchen.run()
+    (kitchen.folder / "cine" / "image").write_text("another")
+
+    def fail(job: Job) -> dict[str, Any]:
+        raise StageError("slice 3: no heart")
+
+    kitchen.bodies["b"] = fail
+    with pytest.raises(StageError, match="slice 3") as caught:
+        kitchen.run()
+    [note] = caught.value.__notes__
+    assert note.startswith(f"b, c in {kitchen.out / 'p1'} came of an earlier run")
+
+
 def test_a_failing_stage_publishes_nothing_and_keeps_what_was_finished(kitchen: Kitchen) -> None:
     def fail(job: Job) -> dict[str, Any]:
         (job.folder / "text").write_text("half")

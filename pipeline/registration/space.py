@@ -25,7 +25,7 @@ from pipeline.registration.frames import TrackedSweep, backwards, mirrored
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.tissue_map import cavities_of
+from pipeline.registration.tissue_map import BLOOD, cavities_of
 from pipeline.registration.uncertainty import (
     chance_below,
     curvature_at,
@@ -41,6 +41,8 @@ _LEAST_IN_VIEW = 0.05
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
 _STEPS = 5
+# By what share of its usual error a model is further off for each surface of blood that it lacks.
+_LACKING = 0.2
 # Points of the heart at which the expected error is looked at, of each surface.
 _POINTS = 200
 
@@ -190,6 +192,10 @@ def find(
     if start is not None:
         require_rigid(start, "initial mr_from_tracker")
     _require_frames(sweeps, phases, settings)
+    lacking = [name for name in BLOOD if name not in surfaces]
+    if lacking:
+        wider_mm = settings.model_error_mm * (1 + _LACKING * len(lacking))
+        settings = settings.model_copy(update={"model_error_mm": wider_mm})
     search = prepare_search(phases, surfaces, start, settings, cine)
     tell(1, _STEPS)
     _require_heart_in_view(search.coarse_level(sweeps), search)
@@ -213,6 +219,9 @@ def find(
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
+    if lacking and result.reason:
+        said = f"the model lacks {', '.join(lacking)}, whose blood it takes for tissue"
+        result = replace(result, reason=f"{result.reason}; {said}")
     return result
 
 
