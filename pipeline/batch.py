@@ -17,6 +17,7 @@ from typing import Any
 from pipeline.errors import InputError
 from pipeline.publish import readable_write_errors
 from pipeline.study import open_study, studies_in
+from pipeline.summary import remarks
 
 NO_STUDY = "no study"
 """Status of a folder among the studies that is none; nothing was run, and nothing failed."""
@@ -37,6 +38,9 @@ class Outcome:
     expected_tre_mm: float | None
     registration: str
     """Its verdict; empty where there is none."""
+
+    remarks: str
+    """What `pipeline.summary.remarks` says of it."""
 
     cause: str
 
@@ -108,7 +112,7 @@ def _require_different_patients(folders: Sequence[Path]) -> None:
 def table(outcomes: Sequence[Outcome]) -> str:
     """The outcomes as text, one line a patient."""
     head = f"{'patient':24s} {'status':8s} {'seconds':>8s} {'LV EF':>6s} {'TRE mm':>7s}"
-    lines = [f"{head} {'expected':>8s}  {'verdict':8s}  cause"]
+    lines = [f"{head} {'expected':>8s}  {'verdict':8s}  cause or remarks"]
     for one in outcomes:
         figures = (
             f"{'-' if value is None else format(value, '.2f'):>{width}s}"
@@ -120,7 +124,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
         )
         lines.append(
             f"{one.patient:24s} {one.status:8s} {one.seconds:8.1f} {' '.join(figures)}  "
-            f"{one.registration or '-':8s}  {one.cause}"
+            f"{one.registration or '-':8s}  {one.cause or one.remarks}"
         )
     return "\n".join(lines)
 
@@ -160,7 +164,7 @@ def _stages(out: Path, study: Path) -> dict[str, Any]:
 
 def _figures(
     stages: dict[str, Any],
-) -> tuple[float | None, float | None, float | None, float | None, str]:
+) -> tuple[float | None, float | None, float | None, float | None, str, str]:
     def figure(stage: str, *keys: str) -> float | None:
         value = stages.get(stage, {}).get("figures", {})
         for key in keys:
@@ -174,6 +178,7 @@ def _figures(
         figure("bake", "accuracy", "distance_error_max_mm"),
         figure("register", "expected_tre_mm"),
         verdict,
+        "; ".join(f"{word}: {text}" for word, text in remarks(stages)),
     )
 
 

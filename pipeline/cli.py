@@ -173,11 +173,12 @@ def bake(
         return 0
     assert surfaces is not None
     from pipeline.config import read_settings
-    from pipeline.own_surfaces import bake_own_surfaces
+    from pipeline.own_surfaces import bake_own_surfaces, fixture_lines
 
     settings = read_settings(config, own_surfaces=True)
     field = bake_own_surfaces(surfaces, out, settings, Console().progress)
     print(f"field     {field}")
+    print("\n".join(f"fixture   {line}" for line in fixture_lines(field)))
     return 0
 
 

@@ -103,6 +103,16 @@ def bake_own_surfaces(
     return field
 
 
+def fixture_lines(field: Path) -> list[str]:
+    """What a baked field's fixtures do, a line each: some may be defaults that nobody wrote."""
+    return [
+        f"{name}: {one.kind.replace('_', ' ')}{f' {one.side}' if one.side else ''} of "
+        f"{one.structure}, {one.f_max_n:g} N at most, next to nothing within "
+        f"{one.resolved_gamma_mm:.1f} mm, for the {one.device}"
+        for name, one in ForceField.open(field).fixtures.items()
+    ]
+
+
 def _with_crossings(message: str, surfaces: Mapping[str, SurfaceSeries]) -> str:
     """Why a field failed, and where a surface passes through itself: that leaves no inside."""
     for name, series in surfaces.items():

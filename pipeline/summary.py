@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from pipeline.imaging.settings import LOW_CONFIDENCE
+
 
 def summary(record: dict[str, Any], products: Path) -> str:
     """A line for each stage, then what to look at.
@@ -24,8 +26,7 @@ def summary(record: dict[str, Any], products: Path) -> str:
     ]
     seconds = sum(stage["seconds"] for stage in record["stages"].values() if _timed(stage))
     lines.append(f"{'total':9s} {record['status']:8s} {seconds:7.1f} s")
-    lines += _orientation(record["stages"].get("segment", {}))
-    lines += _left_out(record["stages"])
+    lines += [f"{word:9s} {text}" for word, text in remarks(record["stages"])]
     lines += _verdict(record["stages"].get("register", {}))
     bake = record["stages"].get("bake", {})
     example = bake.get("figures", {}).get("example")
@@ -43,23 +44,77 @@ def summary(record: dict[str, Any], products: Path) -> str:
     return "\n".join(lines)
 
 
-def _orientation(segment: dict[str, Any]) -> list[str]:
-    """A line where the heart lies otherwise than the file says."""
-    orientation = segment.get("figures", {}).get("orientation", "")
-    if not orientation.startswith("other") or segment["status"] == "stale":
+def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
+    """What a person must know of finished stages before a field is used: a word, and what it is."""
+    figures = {
+        name: stage.get("figures", {})
+        for name, stage in stages.items()
+        if stage.get("status") != "stale"
+    }
+    ingest, segment = figures.get("ingest", {}), figures.get("segment", {})
+    return [
+        *_timing(ingest),
+        *_orientation(segment),
+        *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
+        *_doubtful(segment),
+        *_left_out(figures),
+    ]
+
+
+def _timing(ingest: dict[str, Any]) -> list[tuple[str, str]]:
+    if not str(ingest.get("timing_source", "")).startswith("NIfTI") or ingest["phases"] > 2:
         return []
-    return [f"heart     lies {orientation}; check the file's orientation and order of slices"]
+    return [
+        (
+            "timing",
+            f"two phases evenly over a beat of {ingest['rr_s']:g} s, for the header's time step is "
+            "all that tells; write timing.json if that is not so",
+        )
+    ]
 
 
-def _left_out(stages: dict[str, Any]) -> list[str]:
-    """A line for each surface and default fixture that this study's images do not give."""
-    lines = []
-    for stage, what in (("surface", "surface"), ("bake", "fixture")):
-        if stages.get(stage, {}).get("status") != "stale":
-            left_out = stages.get(stage, {}).get("figures", {}).get("left_out", {})
-            for why, names in by_reason(left_out).items():
-                lines.append(f"left out  {what} {', '.join(names)}: {why}")
-    return lines
+def _orientation(segment: dict[str, Any]) -> list[tuple[str, str]]:
+    orientation = segment.get("orientation", "")
+    if not orientation.startswith("other"):
+        return []
+    return [("heart", f"lies {orientation}; check the file's orientation and order of slices")]
+
+
+def cut_off_by(cut_off: dict[str, dict[Any, int]], ingest: dict[str, Any]) -> list[str]:
+    """Sentences on the structures that end where the stack does, and not by themselves."""
+    places = {
+        f"{body}:{end}": f"at slice {end} in {phases} of {ingest['phases']} phases"
+        for body, ends in cut_off.items()
+        for end, phases in ends.items()
+    }
+    return [
+        f"{', '.join(body.partition(':')[0] for body in bodies)} {place}: surfaces and volumes "
+        "end there"
+        for place, bodies in by_reason(places).items()
+    ]
+
+
+def _doubtful(segment: dict[str, Any]) -> list[tuple[str, str]]:
+    lowest = segment.get("lowest_confidence", 1.0)
+    if lowest >= LOW_CONFIDENCE:
+        return []
+    at = segment["least_certain"]
+    return [
+        (
+            "doubtful",
+            f"labels of slice {at['slice']} in phase {at['phase']}, whose confidence of "
+            f"{lowest:.2f} is the lowest; the report shows all below {LOW_CONFIDENCE:g}",
+        )
+    ]
+
+
+def _left_out(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """Surfaces and default fixtures that this study's images do not give."""
+    return [
+        ("left out", f"{what} {', '.join(names)}: {why}")
+        for stage, what in (("surface", "surface"), ("bake", "fixture"))
+        for why, names in by_reason(figures.get(stage, {}).get("left_out", {})).items()
+    ]
 
 
 def by_reason(left_out: dict[str, str]) -> dict[str, list[str]]:

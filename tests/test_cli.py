@@ -253,6 +253,31 @@ def test_the_summary_says_when_a_heart_lies_otherwise(tmp_path: Path, orientatio
     assert ("lies other than the file says: mirrored;" in said) == orientation.startswith("other")
 
 
+def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Path) -> None:
+    """Labels in doubt, a stack that ends too soon, and a beat that nobody wrote down."""
+    ingest = {"phases": 2, "rr_s": 2.0, "timing_source": "NIfTI time step"}
+    segment = {
+        "orientation": "as the file says",
+        "lowest_confidence": 0.66,
+        "least_certain": {"phase": 1, "slice": 4},
+        "cut_off": {"left atrium": {"9": 2}, "aorta": {"9": 2}, "left ventricle": {"0": 1}},
+    }
+    stages = {
+        "ingest": {"status": "done", "figures": ingest},
+        "segment": {"status": "done", "figures": segment},
+    }
+    said = summary({"status": "done", "stages": stages}, tmp_path).splitlines()
+    assert any(line.startswith("timing    two phases evenly over a beat of 2 s") for line in said)
+    assert any(line.startswith("doubtful  labels of slice 4 in phase 1, whose") for line in said)
+    cut = [line for line in said if line.startswith("cut off")]
+    assert len(cut) == 2
+    assert cut[0].startswith("cut off   left atrium, aorta at slice 9 in 2 of 2 phases")
+    assert cut[1].startswith("cut off   left ventricle at slice 0 in 1 of 2 phases")
+    for stage in stages.values():
+        stage["status"] = "stale"
+    assert len(summary({"status": "done", "stages": stages}, tmp_path).splitlines()) == 4
+
+
 def test_an_interruption_says_what_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

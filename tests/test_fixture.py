@@ -11,6 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from pipeline.config import Settings, read_settings
+from pipeline.errors import InputError
 from pipeline.field.fixture import (
     DEFAULT_FIXTURES,
     DEVICES,
@@ -20,8 +22,10 @@ from pipeline.field.fixture import (
     steepest_slope,
 )
 from pipeline.field.potential import potential
+from pipeline.stages.bake import fixtures_for
 
 GUIDANCE = {"structure": "heart", "kind": "guidance", "delta_mm": 8.0, "f_max_n": 2.0}
+SURFACES, LOST = ("epicardium", "lv_endocardium"), {"left_atrium": "no phase shows it"}
 CONFIGS = Path(__file__).parents[1] / "configs" / "fixtures"
 
 
@@ -137,3 +141,30 @@ def test_settings_load_without_numpy():
         "sys.exit(f'loaded {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+class TestFixturesOfAStudyWithoutAnAtrium:
+    """A stack that ends at the valves: which fixtures are baked, and which are missed."""
+
+    def test_the_defaults_are_baked_but_that_on_the_atrium(self):
+        kept, missing = fixtures_for(Settings(), SURFACES, LOST)
+        assert list(kept) == ["epicardium_guidance", "left_ventricle_forbidden"]
+        assert missing == {"left_atrium_guidance": "needs left_atrium, which has no surface"}
+
+    def test_defaults_written_down_are_defaults(self):
+        """As one who copies configs/default.yaml has them."""
+        written = read_settings(Path(__file__).parents[1] / "configs" / "default.yaml")
+        assert "fixtures" in written.model_fields_set
+        assert fixtures_for(written, SURFACES, LOST) == fixtures_for(Settings(), SURFACES, LOST)
+
+    @pytest.mark.parametrize(
+        ("settings", "who"),
+        [
+            ({"fixtures": {"mine": GUIDANCE | {"structure": "left_atrium"}}}, "fixture mine"),
+            ({"bake": {"structures": ["left_atrium"]}}, "bake.structures left_atrium"),
+        ],
+    )
+    def test_what_a_user_asks_for_is_missed_and_the_cause_told(self, settings, who):
+        words = f"{who} needs left_atrium, which has no surface: no phase shows it; take it out"
+        with pytest.raises(InputError, match=words):
+            fixtures_for(Settings.model_validate(settings), SURFACES, LOST)

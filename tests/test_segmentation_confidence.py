@@ -17,7 +17,7 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import segment_cine
+from pipeline.imaging.segmentation import cut_off, segment_cine
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import view_of
 
@@ -240,3 +240,29 @@ def test_a_heart_that_jumps_for_one_phase_is_doubted():
     assert doubt[2, 2] < 0.3
     doubt[2, 2] = 0.9
     assert doubt.min() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("radii", "found"),
+    [
+        # A paraboloid that ends a third of a slice beyond the last: cuts of 1/3, 4/3, 7/3 ...
+        ((10 * np.sqrt(np.arange(8) + 1 / 3)), {"left ventricle": {7: 1}}),
+        # One that ends a slice and a half beyond.
+        ((10 * np.sqrt(np.arange(8) + 1.5)), {"left ventricle": {0: 1, 7: 1}}),
+        # Whole: both ends within a slice.
+        (np.array([8, 20, 25, 30, 30, 25, 20, 9]), {}),
+        # Not in the outermost slices at all.
+        (np.array([0, 25, 30, 30, 30, 30, 0, 0]), {}),
+        # A speck on the outermost slice beside nothing is the tip.
+        (np.array([5, 6, 30, 30, 30, 30, 0, 0]), {}),
+    ],
+)
+def test_a_stack_that_ends_too_soon_is_known_by_its_last_cuts(radii, found):
+    rows, columns = np.mgrid[-40:41, -40:41]
+    disc = rows**2 + columns**2 < np.square(radii)[:, None, None]
+    labels = np.where(disc, LABELS["lv_cavity"], 0).astype(np.uint8)[None]
+    assert cut_off(labels) == found
+    # The others are judged each for itself, phase by phase.
+    both = np.concatenate([labels, np.where(disc, LABELS["aorta"], 0).astype(np.uint8)[None]])
+    others = {"aorta": found["left ventricle"]} if found else {}
+    assert cut_off(both) == found | others

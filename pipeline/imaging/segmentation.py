@@ -31,9 +31,25 @@ Progress = Callable[[int, int], None]
 LARGEST_BARE = 0.5
 """Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""
 
+MOST_NAMED = 8
+"""Images that one message names."""
+
 LEAST_SHARE = 0.2
 """A slice with less than this share of the heart that both its neighbours show in one place is
 spoilt."""
+
+
+BODIES: dict[str, tuple[str, ...]] = {
+    "left ventricle": ("lv_cavity", "lv_myocardium"),
+    "right ventricle": ("rv_cavity",),
+    "left atrium": ("left_atrium",),
+    "right atrium": ("right_atrium",),
+    "aorta": ("aorta",),
+}
+"""What a stack may cut off, by name for people."""
+
+LEAST_CUT = 0.1
+"""A smaller share of a body's largest cut, on the outermost slice, is its tip."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +130,8 @@ def _require_contrast(cine: Cine) -> None:
         phase, number = np.argwhere(blank)[0]
         raise StageError(
             f"phase {phase}, slice {number}: no heart found: all its pixels are alike; export the "
-            "images again, or leave the slice out"
+            "images again; without this slice the stack must not close up: a gap inside it is "
+            "filled by cine.fill_gaps (DICOM), or by the mean of its neighbours"
         )
 
 
@@ -136,14 +153,19 @@ def _require_understood(
         phase, number = gaps[0]
         raise StageError(
             f"phase {phase}, slice {view.order[number + 1]}: no heart found, though the slices on "
-            "both sides show it; check this image, or leave the slice out"
+            "both sides show it; check this image. To do without it, draw it between its "
+            "neighbours: cine.fill_gaps without its DICOM files, in NIfTI their mean in its place"
         )
     if confidence.min() < settings.min_confidence:
         worst = np.unravel_index(confidence.argmin(), confidence.shape)
+        low = np.argwhere(confidence < settings.min_confidence)
+        others = ", ".join(f"{k}/{view.order[z]}" for k, z in low[:MOST_NAMED])
         raise StageError(
             f"phase {worst[0]}, slice {view.order[worst[1]]}: the labels are not certain enough: "
-            f"confidence {confidence.min():.2f}, at least {settings.min_confidence:.2f} is needed; "
-            "check this image, or lower segment.min_confidence"
+            f"confidence {confidence.min():.2f}, at least {settings.min_confidence:.2f} is needed "
+            f"({len(low)} images have less, phase/slice {others}"
+            f"{' ...' if len(low) > MOST_NAMED else ''}); check them, or lower "
+            "segment.min_confidence"
         )
 
 
@@ -244,3 +266,25 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
             chance: Float32 = np.stack([carried[0] + 2, *carried[1:]])
             labels[phase, z] = chance.argmax(axis=0)
     return labels
+
+
+def cut_off(labels: Label) -> dict[str, dict[int, int]]:
+    """Where the stack's ends cut structures off: ``{body: {slice: phases in which it does}}``.
+
+    A body whose cuts shrink towards the outermost slice as a paraboloid's do, in a straight line,
+    goes on for more than a slice where the last cut is more than half of the one before.
+
+    Parameters
+    ----------
+    labels
+        ``(phase, z, y, x)`` on the cine's slices.
+    """
+    found: dict[str, dict[int, int]] = {}
+    last = labels.shape[1] - 1
+    for body, names in BODIES.items():
+        area = np.isin(labels, [LABELS[name] for name in names]).sum(axis=(2, 3))
+        for end, inner in ((0, 1), (last, last - 1)):
+            goes_on = area[:, end] > np.maximum(area[:, inner] / 2, LEAST_CUT * area.max())
+            if goes_on.any():
+                found.setdefault(body, {})[end] = int(goes_on.sum())
+    return found

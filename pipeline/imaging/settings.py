@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+LOW_CONFIDENCE = 0.8
+"""Labels of an image that are trusted less are shown as doubtful."""
+
 
 class SegmentSettings(BaseModel):
     """How the heart is labelled in the images and carried to an isotropic grid."""

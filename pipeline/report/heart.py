@@ -14,9 +14,6 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Picture, Section, Table, picture
 from pipeline.report.style import as_png, as_svg, as_webp
 
-LOW_CONFIDENCE = 0.8
-"""Below this a slice is shown as doubtful, unless the segmentation itself says otherwise."""
-
 MOST_DOUBTS = 12
 
 CONTOUR_DOTS_PER_INCH = 110

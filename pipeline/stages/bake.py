@@ -10,7 +10,7 @@ import numpy as np
 from pipeline import __version__
 from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
-from pipeline.field.fixture import Fixture
+from pipeline.field.fixture import DEFAULT_FIXTURES, Fixture
 from pipeline.geometry import MovingSurface
 from pipeline.job import Job
 from pipeline.products import read_surfaces, read_table
@@ -52,7 +52,8 @@ def fixtures_for(
 ) -> tuple[dict[str, Fixture], dict[str, str]]:
     """The fixtures to bake, and those that a study's images do not allow, with the reason.
 
-    A default fixture is left out where its surface is missing; one that the user asked for is not.
+    A default fixture is left out where its surface is missing, also where a configuration repeats
+    it as it is; one of the user's own is not.
 
     Parameters
     ----------
@@ -72,12 +73,21 @@ def fixtures_for(
         for name, one in settings.fixtures.items()
         if name not in kept
     }
-    if missing and "fixtures" in settings.model_fields_set:
+    wanted = {
+        f"fixture {name}": one.structure
+        for name, one in settings.fixtures.items()
+        if name in missing and one != DEFAULT_FIXTURES.get(name)
+    }
+    wanted |= {f"bake.structures {name}": name for name in settings.bake.structures if name in lost}
+    if wanted or not kept:
+        wanted = wanted or {
+            f"fixture {name}": settings.fixtures[name].structure for name in missing
+        }
         said = "; ".join(
-            f"fixture {name} {needs}: {lost[settings.fixtures[name].structure]}"
-            for name, needs in missing.items()
+            f"{who} needs {name}, which has no surface: {lost[name]}"
+            for who, name in wanted.items()
         )
-        raise InputError(f"{said}; change the fixture's structure, or take the fixture out")
+        raise InputError(f"{said}; take it out of the configuration, or name another structure")
     return kept, missing
 
 

@@ -10,6 +10,7 @@ from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.nifti import read_image
+from pipeline.imaging.settings import LOW_CONFIDENCE
 from pipeline.imaging.ultrasound import read_sweep
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
@@ -21,7 +22,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
-from pipeline.summary import by_reason
+from pipeline.summary import by_reason, cut_off_by
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -72,7 +73,7 @@ def _moments(job: Job, cine: Cine, numbers: tuple[int, int]) -> Moments:
 def _confidence(job: Job) -> tuple[Float, float]:
     """Confidence ``(phase, slice)``, NaN where it was not judged, and what counts as low."""
     said = read_table(job.products / "segment" / "confidence.json")
-    low = float(said.get("low_below", heart.LOW_CONFIDENCE))
+    low = float(said.get("low_below", LOW_CONFIDENCE))
     return np.array(said["confidence"], dtype=float), low
 
 
@@ -109,10 +110,13 @@ def _notes(job: Job) -> list[str]:
             f"The heart lies {orientation}. All products are in the file's frame: check the order "
             "of the slices and the orientation in the file before a field is used with a tracker."
         )
-    missing = job.figures("ingest")["interpolated_slices"]
+    ingest = job.figures("ingest")
+    missing = ingest["interpolated_slices"]
     if missing:
         named = ", ".join(str(number) for number in missing)
         notes.append(f"Not recorded, so drawn between their neighbours: slices {named}.")
+    for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
+        notes.append(f"Cut off by the stack's end: {text}.")
     for why, names in by_reason(job.figures("surface")["left_out"]).items():
         notes.append(f"No surface of {', '.join(names).replace('_', ' ')}: {why}.")
     for name, why in job.figures("bake")["left_out"].items():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import segment_cine
+from pipeline.imaging.segmentation import cut_off, segment_cine
 from pipeline.job import Job
 from pipeline.products import read_cine, read_long_axis, write_labels, write_table
 
@@ -29,9 +29,11 @@ def run(job: Job) -> dict[str, Any]:
         name: [round(float((volume == value).sum()) * voxel_ml, 1) for volume in found.heart]
         for name, value in LABELS.items()
     }
-    confidence = found.confidence[np.isfinite(found.confidence)]
+    lowest = np.unravel_index(np.nanargmin(found.confidence), found.confidence.shape)
     return {
-        "lowest_confidence": round(float(confidence.min()), 3),
+        "lowest_confidence": round(float(found.confidence[lowest]), 3),
+        "least_certain": {"phase": int(lowest[0]), "slice": int(lowest[1])},
+        "cut_off": cut_off(found.labels),
         "orientation": str(found.orientation),
         "volumes_ml": volumes,
     }
