@@ -72,7 +72,7 @@ def require_whole(path: Path) -> None:
 
 def _require_whole_vtp(path: Path, content: bytes) -> None:
     if not content.rstrip().endswith(b"</VTKFile>"):
-        raise InputError(f"{path}: is no whole VTP file: it does not end with </VTKFile>")
+        raise InputError(f"{path}: is no whole VTP file: no </VTKFile> at its end; copy it again")
 
 
 def _require_whole_stl(path: Path, content: bytes) -> None:

@@ -218,6 +218,17 @@ def test_a_file_of_one_phase_is_answered_with_what_to_do(tmp_path: Path) -> None
         read_nifti_cine(tmp_path / "ed.nii.gz", None)
 
 
+def test_complex_voxels_and_a_beat_without_moments_are_named(tmp_path: Path) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4, 5), np.complex64), np.diag([1, 1, 8, 1.0]))
+    nibabel.save(image, tmp_path / "complex.nii.gz")
+    with pytest.raises(InputError, match="voxels are complex numbers; store their magnitude"):
+        read_nifti_cine(tmp_path / "complex.nii.gz", None, 800)
+    nifti_cine(tmp_path / "cine.nii", np.diag([1.5, 1.5, 8, 1]))
+    (tmp_path / "timing.json").write_text('{"rr_ms": 800}')
+    with pytest.raises(InputError, match=r"it holds rr_ms; .* give cine\.rr_ms in study\.yaml"):
+        read_nifti_cine(tmp_path / "cine.nii", tmp_path / "timing.json")
+
+
 @pytest.mark.parametrize("shape", [(2, 40, 44, 7), (7, 40, 44, 2)])
 def test_axes_in_another_order_are_named(tmp_path: Path, shape: tuple[int, ...]) -> None:
     """Time or the slices first, as arrays of Python often have them."""

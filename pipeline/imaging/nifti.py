@@ -166,9 +166,12 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
 
 def _load(path: Path) -> Any:
     try:
-        return nibabel.load(path)
+        image: Any = nibabel.load(path)
     except (ImageFileError, OSError, EOFError) as error:
         raise InputError(f"{path}: cannot be read as NIfTI ({error})") from error
+    if image.get_data_dtype().kind == "c":
+        raise InputError(f"{path}: its voxels are complex numbers; store their magnitude")
+    return image
 
 
 def _right_angled_affine(image: Any, path: Path) -> Float:
@@ -237,7 +240,10 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(content, dict) or not {"trigger_times_ms", "rr_ms"} <= set(content):
         found = ", ".join(content) if isinstance(content, dict) else repr(content)
-        raise InputError(f"{path}: {needed}; it holds {found or 'nothing'}")
+        evenly = ""
+        if found == "rr_ms":
+            evenly = "; for phases evenly over the beat give cine.rr_ms in study.yaml in its place"
+        raise InputError(f"{path}: {needed}; it holds {found or 'nothing'}{evenly}")
     given = []
     for key, shape in (("trigger_times_ms", (slices, phases)), ("rr_ms", (slices,))):
         try:

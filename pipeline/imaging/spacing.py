@@ -56,12 +56,18 @@ def regular_steps(
     wide = np.flatnonzero((counts > 1) & too_wide)
     if len(wide):
         first = wide[0]
+        remedy = (
+            f"; cine.fill_gaps fills one slice in at most {WIDEST_GAP_MM:g} mm, which this is not; "
+            "add the missing slice"
+            if fill
+            else "; add the missing slice, or, where it is one in at most "
+            f"{WIDEST_GAP_MM:g} mm, let its neighbours stand in for it: cine.fill_gaps: true in "
+            "study.yaml"
+        )
         raise InputError(
             f"{where}: missing slice between {slices[first][0].where} and "
             f"{slices[first + 1][0].where}: {lengths_mm[first]:.2f} mm apart, the others are "
-            f"{usual_mm:.2f} mm apart; add the missing slice, or, where it is one in at most "
-            f"{WIDEST_GAP_MM:g} mm, let its neighbours stand in for it: cine.fill_gaps: true in "
-            "study.yaml"
+            f"{usual_mm:.2f} mm apart{remedy}"
         )
     return np.asarray(step_mm), np.asarray(numbers, np.int64)
 
