@@ -7,6 +7,9 @@ from typing import Any
 
 from pipeline.imaging.settings import LOW_CONFIDENCE
 
+TOLD_BELOW = 0.7
+"""Confidence at which labels are told beside the report, too: of 40 sound studies 2 had less."""
+
 
 def summary(record: dict[str, Any], products: Path) -> str:
     """A line for each stage, then what to look at.
@@ -96,7 +99,7 @@ def cut_off_by(cut_off: dict[str, dict[Any, int]], ingest: dict[str, Any]) -> li
 
 def _doubtful(segment: dict[str, Any]) -> list[tuple[str, str]]:
     lowest = segment.get("lowest_confidence", 1.0)
-    if lowest >= LOW_CONFIDENCE:
+    if lowest >= TOLD_BELOW:
         return []
     at = segment["least_certain"]
     return [

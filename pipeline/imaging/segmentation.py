@@ -51,6 +51,11 @@ BODIES: dict[str, tuple[str, ...]] = {
 LEAST_CUT = 0.1
 """A smaller share of a body's largest cut, on the outermost slice, is its tip."""
 
+GOES_ON, BLUNT = 2 / 3, 0.9
+"""Shares of the cut before it that the outermost slice shows of a body that goes on. A paraboloid's
+cuts fall in a straight line: two thirds are left two slices from its end. A tip is blunter, but of
+40 whole stacks one alone showed more than 0.61 in the median phase."""
+
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
@@ -269,10 +274,11 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
 
 
 def cut_off(labels: Label) -> dict[str, dict[int, int]]:
-    """Where the stack's ends cut structures off: ``{body: {slice: phases in which it does}}``.
+    """Where the stack's ends cut structures off: ``{body: {slice: phases in which it goes on}}``.
 
-    A body whose cuts shrink towards the outermost slice as a paraboloid's do, in a straight line,
-    goes on for more than a slice where the last cut is more than half of the one before.
+    A body goes on beyond the outermost slice where its cut there is more than `GOES_ON` of the one
+    before: it would end some two slices farther. It is told where it does in half of the phases,
+    for a tip comes and goes with noise, or leaves the stack with hardly a smaller cut in any.
 
     Parameters
     ----------
@@ -284,7 +290,8 @@ def cut_off(labels: Label) -> dict[str, dict[int, int]]:
     for body, names in BODIES.items():
         area = np.isin(labels, [LABELS[name] for name in names]).sum(axis=(2, 3))
         for end, inner in ((0, 1), (last, last - 1)):
-            goes_on = area[:, end] > np.maximum(area[:, inner] / 2, LEAST_CUT * area.max())
-            if goes_on.any():
-                found.setdefault(body, {})[end] = int(goes_on.sum())
+            share = area[:, end] / np.maximum(area[:, inner], 1)
+            share[area[:, end] < LEAST_CUT * area.max()] = 0
+            if (share > GOES_ON).mean() >= 0.5 or share.max() > BLUNT:
+                found.setdefault(body, {})[end] = int((share > GOES_ON).sum())
     return found
