@@ -108,7 +108,7 @@ def fixture_lines(field: Path) -> list[str]:
     return [
         f"{name}: {one.kind.replace('_', ' ')}{f' {one.side}' if one.side else ''} of "
         f"{one.structure}, {one.f_max_n:g} N at most, next to nothing within "
-        f"{one.resolved_gamma_mm:.1f} mm, for the {one.device}"
+        f"{one.resolved_gamma_mm:.1f} mm, for the {one.device.name}"
         for name, one in ForceField.open(field).fixtures.items()
     ]
 

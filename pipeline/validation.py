@@ -26,6 +26,10 @@ def describe_validation(
         message = one["msg"].removeprefix("Value error, ")
         if one["type"] == "extra_forbidden":
             message = f"unknown key; {_instead(one['loc'], model, other)}"
+        elif one["type"] == "missing":
+            message = "is missing"
+            if model is not None:
+                message += "; what stands here replaces a default, so all of it must be written"
         elif one["type"] == "model_type" and (below := _keys(_at(one["loc"], model))):
             message = f"needs keys below it ({', '.join(below)})"
         elif one["type"].startswith("union_tag"):

@@ -196,6 +196,31 @@ def test_sealed_but_wrong_descriptions_are_found(copy, change, words):
         verify_field(copy)
 
 
+def test_a_device_of_ones_own_is_kept_with_its_limits(copy):
+    law = ForceField.open(copy).fixtures["guide"]
+    most = {"force_n": law.f_max_n, "stiffness_n_per_m": law.stiffness_n_per_m}
+    edit(copy, lambda b: b["fixtures"]["guide"].update(device="virtuose", device_limits=most))
+    assert verify_field(copy)
+    found = ForceField.open(copy).fixtures["guide"].device
+    assert (found.name, found.force_n) == ("virtuose", law.f_max_n)
+
+    less = most | {"stiffness_n_per_m": 0.9 * law.stiffness_n_per_m}
+    edit(copy, lambda b: b["fixtures"]["guide"].update(device_limits=less))
+    with pytest.raises(InputError, match=r"guide: .*stiffer than the virtuose can render"):
+        ForceField.open(copy)
+
+
+def test_a_store_may_name_a_known_device_alone(copy):
+    """As stores did before limits stood in them; of others they must."""
+    known = ForceField.open(copy).fixtures
+    edit(copy, lambda b: [one.pop("device_limits") for one in b["fixtures"].values()])
+    assert ForceField.open(copy).fixtures == known
+
+    edit(copy, lambda b: b["fixtures"]["guide"].update(device="virtuose"))
+    with pytest.raises(InputError, match=r"guide\.device_limits: Field required"):
+        ForceField.open(copy)
+
+
 @pytest.mark.parametrize("array", ["distance/ball", "potential/stay_out"])
 def test_sealed_values_that_are_no_numbers_are_found(copy, array):
     chunk = copy / array / "c" / "3" / "0" / "0" / "0"

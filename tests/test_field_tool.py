@@ -184,5 +184,5 @@ def test_a_wrong_mesh_is_noticed_with_its_tool(tmp_path, name, words, strict):
 
 def test_a_wrong_key_is_named_beside_the_missing_one(tmp_path):
     (tmp_path / "t.yaml").write_text("shape: torus\nradius: 10\n")
-    with pytest.raises(InputError, match=r"(?s)radius_mm: Field required.*radius: unknown key"):
+    with pytest.raises(InputError, match=r"(?s)radius_mm: is missing.*radius: unknown key"):
         read_tool(tmp_path / "t.yaml")

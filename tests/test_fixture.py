@@ -25,6 +25,7 @@ from pipeline.field.potential import potential
 from pipeline.stages.bake import fixtures_for
 
 GUIDANCE = {"structure": "heart", "kind": "guidance", "delta_mm": 8.0, "f_max_n": 2.0}
+MINE = {"name": "virtuose", "force_n": 20, "stiffness_n_per_m": 1200}
 SURFACES, LOST = ("epicardium", "lv_endocardium"), {"left_atrium": "no phase shows it"}
 CONFIGS = Path(__file__).parents[1] / "configs" / "fixtures"
 
@@ -80,7 +81,11 @@ def test_gamma_and_delta_describe_the_same_fixture():
         ({"m": 0}, "greater than or equal to 1"),
         ({"m": 1.5}, "valid integer"),
         ({"delta_mm": float("nan")}, "finite number"),
-        ({"device": "hammer"}, "'touch', 'falcon' or 'omega7'"),
+        ({"device": "hammer"}, "none of touch, falcon, omega7; describe one of your own"),
+        ({"device": {"name": "touch", "force_n": 9, "stiffness_n_per_m": None}}, "touch is known"),
+        ({"device": {"name": "mine", "force_n": 9}}, "device.stiffness_n_per_m"),
+        ({"device": MINE, "f_max_n": 20.5}, "20.5 N is beyond the virtuose, which exerts 20 N"),
+        ({"device": MINE, "f_max_n": 16}, "stiffer than the virtuose can render.*most 1200 N/m"),
         ({"kind": "push"}, "'guidance' or 'forbidden_region'"),
         ({"stifness": 3}, "Extra inputs are not permitted"),
     ],
@@ -131,7 +136,14 @@ def test_default_fixtures_are_those_of_the_files():
         found |= yaml.safe_load(path.read_text())["fixtures"]
 
     assert {name: Fixture.model_validate(one) for name, one in found.items()} == DEFAULT_FIXTURES
-    assert {one.device for one in DEFAULT_FIXTURES.values()} == {"touch"}
+    assert {one.device.name for one in DEFAULT_FIXTURES.values()} == {"touch"}
+
+
+def test_settings_written_down_are_read_back():
+    """A known device by its name alone, one's own as it was described."""
+    for one in (fixture(), fixture(device="omega7"), fixture(device=MINE, f_max_n=10)):
+        assert Fixture.model_validate(one.model_dump(exclude_unset=True)) == one
+    assert fixture(device="omega7").model_dump()["device"] == "omega7"
 
 
 def test_settings_load_without_numpy():

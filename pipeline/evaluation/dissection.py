@@ -20,10 +20,10 @@ from scipy.stats import t as student
 
 from pipeline.errors import InputError
 from pipeline.evaluation.dissection_values import ENERGY_STEP_MM, SUMS, Guide, Shape, Task
-from pipeline.evaluation.operators import HANDLES, operator
+from pipeline.evaluation.operators import handle_of, operator
 from pipeline.evaluation.places import on_surface, settle
 from pipeline.field.files import map_phase, read_metadata, readable_in_fours
-from pipeline.field.fixture import DeviceName, Fixture
+from pipeline.field.fixture import DEVICES, DeviceName, Fixture
 from pipeline.field.reader import ForceField
 from pipeline.field.spline import timeline
 from pipeline.field.tool import Needle, Polyline, Torus
@@ -91,9 +91,9 @@ class Condition:
     """Between the monitor's view axis and the heart's normal."""
 
     @property
-    def handle(self) -> DeviceName:
+    def handle(self) -> str:
         """The device in the hand."""
-        return self.fixture.device if self.fixture else self.device
+        return self.fixture.device.name if self.fixture else self.device
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,12 @@ def guidance(structure: str, device: DeviceName) -> Fixture:
     if device == "touch":
         return Fixture(structure=structure, kind="guidance", delta_mm=3.1, m=1, f_max_n=2.0)
     return Fixture(
-        structure=structure, kind="guidance", gamma_mm=1.5, m=2, f_max_n=6.0, device=device
+        structure=structure,
+        kind="guidance",
+        gamma_mm=1.5,
+        m=2,
+        f_max_n=6.0,
+        device=DEVICES[device],
     )
 
 
@@ -190,7 +195,7 @@ def keep_out(structure: str, device: DeviceName) -> Fixture:
         )
     return Fixture(
         structure=structure, kind="forbidden_region", side="inside", gamma_mm=1.0, m=2, f_max_n=8.0,
-        device=device,
+        device=DEVICES[device],
     )  # fmt: skip
 
 
@@ -291,7 +296,7 @@ def run_trial(
     trace = np.zeros((trace_rows, 9))
     sums = dissect(
         room.task(condition, tick_s), guide, shape_of(condition.tool), person,
-        HANDLES[condition.handle], waves, draws, trace,
+        handle_of(condition.handle), waves, draws, trace,
     )  # fmt: skip
     return Trial(sums, trace)
 

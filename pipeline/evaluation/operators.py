@@ -112,6 +112,11 @@ HANDLES: dict[str, Handle] = {
 }
 
 
+def handle_of(device: str) -> Handle:
+    """What is known of a device; of others than a Touch that they are as heavy as an omega.7."""
+    return HANDLES.get(device, HANDLES["omega7"])
+
+
 def operator(seed: int, number: int, **scaled: float) -> tuple[Operator, Float]:
     """One operator of the population, and the waves of the tremor.
 

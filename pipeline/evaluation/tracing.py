@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.evaluation.operators import HANDLES, POPULATION
+from pipeline.evaluation.operators import POPULATION, handle_of
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float
 
@@ -46,7 +46,7 @@ def trace_along(
         Whether the fixture's force is rendered.
     """
     assert field.rr_s is not None
-    handle = HANDLES[field.fixtures[fixture].device]
+    handle = handle_of(field.fixtures[fixture].device.name)
     mass = (handle.mass_kg + POPULATION["hand_kg"].centre) / 1000
     stiff = POPULATION["stiffness_n_per_mm"].centre
     damp = 2 * POPULATION["damping_ratio"].centre * math.sqrt(stiff * mass)

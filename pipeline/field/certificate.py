@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.field.exact import ExactSurface, points_about
-from pipeline.field.fixture import DEVICES, Bounds, Fixture
+from pipeline.field.fixture import Bounds, Fixture
 from pipeline.field.motion import BeatingSurface, Motion, halfway
 from pipeline.field.reader import ForceField
 from pipeline.field.stiffness import STEP_MM, field_rates_n_per_m
@@ -351,7 +351,7 @@ class _ForceSteps:
 
     def _holding(self) -> dict[str, Any]:
         """The stiffness that holds a tool, in whichever direction it is largest, at all places."""
-        limit = DEVICES[self._fixture.device].stiffness_n_per_m
+        limit = self._fixture.device.stiffness_n_per_m
         holding = np.concatenate([one.holding_n_per_m for one in self._sampled])
         return {
             "stiffness_limit_n_per_m": limit,

@@ -8,11 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
 Kind = Literal["guidance", "forbidden_region"]
 Side = Literal["inside", "outside"]
@@ -20,26 +26,6 @@ DeviceName = Literal["touch", "falcon", "omega7"]
 
 # A delta that was computed as the smallest allowed must itself be allowed after rounding.
 ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class Device:
-    """What a haptic device can render."""
-
-    force_n: float
-    """Largest force it can exert."""
-
-    stiffness_n_per_m: float | None
-    """Stiffest spring it can render; None where none is known and only the force is checked."""
-
-
-DEVICES: Mapping[str, Device] = MappingProxyType(
-    {
-        "touch": Device(force_n=3.3, stiffness_n_per_m=400.0),
-        "falcon": Device(force_n=8.9, stiffness_n_per_m=None),
-        "omega7": Device(force_n=12.0, stiffness_n_per_m=5000.0),
-    }
-)
 
 
 def steepest_slope(m: int) -> float:
@@ -70,6 +56,28 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class Device(Section):
+    """What a haptic device can render."""
+
+    name: str = Field(min_length=1)
+
+    force_n: float = Field(gt=0)
+    """Largest force it can exert."""
+
+    stiffness_n_per_m: float | None = Field(gt=0)
+    """Stiffest spring it can render; None where none is known and only the force is checked."""
+
+
+DEVICES: Mapping[str, Device] = MappingProxyType(
+    {
+        "touch": Device(name="touch", force_n=3.3, stiffness_n_per_m=400.0),
+        "falcon": Device(name="falcon", force_n=8.9, stiffness_n_per_m=None),
+        "omega7": Device(name="omega7", force_n=12.0, stiffness_n_per_m=5000.0),
+    }
+)
+"""Those that a name alone stands for."""
+
+
 class Fixture(Section):
     """One virtual fixture: which surface acts on the tool, and how."""
 
@@ -97,8 +105,33 @@ class Fixture(Section):
     f_max_n: float = Field(gt=0)
     """Force far from the floor of the well."""
 
-    device: DeviceName = "touch"
-    """The haptic device that will render the force."""
+    device: Device = DEVICES["touch"]
+    """The haptic device that will render the force: a name of `DEVICES`, or one of one's own."""
+
+    @field_validator("device", mode="before")
+    @classmethod
+    def _known_by_name(cls, given: Any) -> Any:
+        if isinstance(given, Device | dict):
+            return given
+        for name, device in DEVICES.items():
+            if given == name:
+                return device
+        raise ValueError(
+            f"is none of {', '.join(DEVICES)}; describe one of your own, as "
+            "{name: mine, force_n: 10, stiffness_n_per_m: 2000}"
+        )
+
+    @field_validator("device")
+    @classmethod
+    def _known_as_they_are(cls, device: Device) -> Device:
+        for name, known in DEVICES.items():
+            if device.name == name and device != known:
+                raise ValueError(f"{name} is known, with other limits; take another name")
+        return device
+
+    @field_serializer("device")
+    def _name_of_the_known(self, device: Device) -> Any:
+        return device.name if device in DEVICES.values() else device.model_dump()
 
     @model_validator(mode="after")
     def _one_width(self) -> Self:
@@ -119,10 +152,10 @@ class Fixture(Section):
 
     @model_validator(mode="after")
     def _within_the_device(self) -> Self:
-        limit = DEVICES[self.device]
+        limit = self.device
         if self.f_max_n > limit.force_n * (1 + ROUNDING):
             raise ValueError(
-                f"f_max_n = {self.f_max_n:g} N is beyond the {self.device}, which exerts "
+                f"f_max_n = {self.f_max_n:g} N is beyond the {limit.name}, which exerts "
                 f"{limit.force_n:g} N at most; lower f_max_n or choose another device"
             )
         allowed = limit.stiffness_n_per_m
@@ -131,7 +164,8 @@ class Fixture(Section):
         return self
 
     def _too_stiff(self, allowed_n_per_m: float) -> str:
-        factor = self.stiffness_n_per_m / allowed_n_per_m
+        stiffness = self.stiffness_n_per_m
+        factor = stiffness / allowed_n_per_m
         name = "delta_mm" if self.gamma_mm is None else "gamma_mm"
         given = self.delta_mm if self.gamma_mm is None else self.gamma_mm
         assert given is not None
@@ -140,7 +174,7 @@ class Fixture(Section):
         smallest_delta = math.ceil(self.resolved_delta_mm * factor * 1e3) / 1e3
         also = "" if name == "delta_mm" else f", which is {name} = {smallest:g}"
         return (
-            f"is stiffer than the {self.device} can render: {self.stiffness_n_per_m:.0f} N/m, at "
+            f"is stiffer than the {self.device.name} can render: {stiffness:.0f} N/m, at "
             f"most {allowed_n_per_m:g} N/m; the smallest width that would do is delta_mm = "
             f"{smallest_delta:g}{also} (or lower f_max_n)"
         )

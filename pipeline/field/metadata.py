@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.errors import InputError
-from pipeline.field.fixture import DeviceName, Fixture, Kind, Side
+from pipeline.field.fixture import DEVICES, Device, Fixture, Kind, Side
 
 FORMAT_VERSION = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -59,6 +59,14 @@ class StructurePart(Part):
     """Largest change of a coefficient that brought the spline's zero to the moving surface."""
 
 
+class DeviceLimits(Part):
+    """What the device that a fixture was made for renders at most."""
+
+    force_n: float
+    stiffness_n_per_m: float | None
+    """None where it is not known."""
+
+
 class FixturePart(Part):
     """One fixture's potential, as resolved."""
 
@@ -71,7 +79,8 @@ class FixturePart(Part):
     delta_mm: float
     m: int
     f_max_n: float
-    device: DeviceName
+    device: str
+    device_limits: DeviceLimits
     stiffness_n_per_m: float
 
     @classmethod
@@ -87,9 +96,24 @@ class FixturePart(Part):
             delta_mm=fixture.resolved_delta_mm,
             m=fixture.m,
             f_max_n=fixture.f_max_n,
-            device=fixture.device,
+            device=fixture.device.name,
+            device_limits=DeviceLimits(
+                force_n=fixture.device.force_n,
+                stiffness_n_per_m=fixture.device.stiffness_n_per_m,
+            ),
             stiffness_n_per_m=fixture.stiffness_n_per_m,
         )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_of_the_known(cls, given: Any) -> Any:
+        """Stores of version 1 may name a known device without its limits."""
+        if isinstance(given, dict) and "device_limits" not in given:
+            for name, device in DEVICES.items():
+                if given.get("device") == name:
+                    limits = device.model_dump(exclude={"name"})
+                    return given | {"device_limits": limits}
+        return given
 
     def fixture(self) -> Fixture:
         """The fixture that these numbers describe."""
@@ -100,7 +124,7 @@ class FixturePart(Part):
             delta_mm=self.delta_mm,
             m=self.m,
             f_max_n=self.f_max_n,
-            device=self.device,
+            device=Device(name=self.device, **self.device_limits.model_dump()),
         )
 
 

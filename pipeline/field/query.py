@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.field.fixture import DEVICES
 from pipeline.field.reader import ForceField
 
 
@@ -57,7 +56,7 @@ def query_point(
             "force_rate_n_per_ms": _force_rate(field, point_mm, phase, name),
             "stiffness_n_per_m": law.stiffness_n_per_m,
             "stiffness_measured_n_per_m": _measured(field, name),
-            "stiffness_limit_n_per_m": DEVICES[law.device].stiffness_n_per_m,
+            "stiffness_limit_n_per_m": law.device.stiffness_n_per_m,
         }
         for name, law in field.fixtures.items()
         if fixture in (None, name)

@@ -48,7 +48,7 @@ def law_of(m: int, structure: str) -> Fixture:
     """The guidance of one m that the figures compare."""
     return Fixture(
         structure=structure, kind="guidance", delta_mm=DELTA_MM, m=m, f_max_n=FORCE_N,
-        device="omega7",
+        device=DEVICES["omega7"],
     )  # fmt: skip
 
 

@@ -189,7 +189,7 @@ def _field(job: Job, shown: Moments) -> Section:
             str(fixture.m),
             f"{fixture.f_max_n:g}",
             f"{fixture.stiffness_n_per_m:.0f}",
-            fixture.device,
+            fixture.device.name,
         )
         for fixture_name, fixture in field.fixtures.items()
     ]
