@@ -206,6 +206,7 @@ def _described(study: Study, stage: Stage) -> dict[str, Any]:
     if "cine" in stage.inputs:
         says["rr_ms"] = study.cine.rr_ms
         says["fill_gaps"] = study.cine.fill_gaps
+        says["spoilt_slices"] = study.cine.spoilt_slices
     if "us" in stage.inputs and study.us:
         says["initial_mr_from_tracker"] = study.us.initial_mr_from_tracker
     return says

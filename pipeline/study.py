@@ -39,6 +39,10 @@ class CineFiles(_Section):
     fill_gaps: bool = False
     """Let the mean of both neighbours stand in for a slice that is missing from DICOM files."""
 
+    spoilt_slices: tuple[int, ...] = ()
+    """Slices, counted from 0 as messages and pictures do, whose images are not to be used: the mean
+    of both neighbours stands in for each."""
+
 
 class EcgFiles(_Section):
     """ECG records during MR and during ultrasound; WFDB records are named by their stem."""
@@ -314,7 +318,8 @@ def _require_what_fits_the_cine(study: Study) -> None:
     if cine.path.is_file() and cine.fill_gaps:
         raise InputError(
             f"{described}: cine.fill_gaps: applies to DICOM only, and {cine.path} is NIfTI; take "
-            "the key out, and if slices are missing from the file, fill them in it"
+            "the key out; of a slice that is in the file but unusable, give the number under "
+            "cine.spoilt_slices"
         )
     if cine.path.is_dir() and cine.timing:
         raise InputError(

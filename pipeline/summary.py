@@ -57,6 +57,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
     ingest, segment = figures.get("ingest", {}), figures.get("segment", {})
     return [
         *_timing(ingest),
+        *[("input", text) for text in ingest.get("remarks", [])],
         *_orientation(segment),
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
         *_doubtful(segment),

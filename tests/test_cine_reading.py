@@ -245,6 +245,35 @@ def test_voxels_in_metres_or_micrometres_are_named(tmp_path: Path, unit: float) 
         read_nifti_cine(tmp_path / "cine.nii", None)
 
 
+def placed(path: Path, sform: int, qform: int, apart_mm: float = 0.0) -> tuple[str, ...]:
+    """What is told of a file whose header has these codes, and two placements so far apart."""
+    nifti_cine(path / "cine.nii", np.diag([1.5, 1.5, 8, 1]))
+    image = nibabel.load(path / "cine.nii")
+    other = image.affine.copy()
+    other[0, 3] += apart_mm
+    image.set_sform(image.affine, sform)
+    image.set_qform(other, qform)
+    nibabel.save(image, path / "placed.nii.gz")
+    return read_nifti_cine(path / "placed.nii.gz", None).remarks
+
+
+def test_a_header_that_places_the_images_nowhere_is_told(tmp_path: Path) -> None:
+    (remark,) = placed(tmp_path, 0, 0)
+    assert "places the images nowhere" in remark
+
+
+def test_two_placements_that_differ_are_told(tmp_path: Path) -> None:
+    assert placed(tmp_path, 1, 1, 0.4) == placed(tmp_path, 1, 0, 20) == placed(tmp_path, 0, 1) == ()
+    (remark,) = placed(tmp_path, 1, 1, 12.5)
+    assert "up to 12.5 mm apart; the sform is taken" in remark
+
+
+def test_an_axis_too_many_is_named(tmp_path: Path) -> None:
+    nibabel.save(nibabel.Nifti1Image(np.zeros((8, 6, 4, 1, 5)), np.eye(4)), tmp_path / "a.nii")
+    with pytest.raises(InputError, match=r"\(8, 6, 4, 1, 5\); store it without the axes of length"):
+        read_nifti_cine(tmp_path / "a.nii", None)
+
+
 def test_a_sheared_affine_is_refused(tmp_path: Path) -> None:
     affine = np.diag([1.5, 1.5, 10, 1.0])
     affine[0, 1] = 0.2

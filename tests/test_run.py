@@ -125,7 +125,7 @@ def test_a_changed_setting_runs_only_the_stages_that_read_it(kitchen: Kitchen) -
     # b's product came out the same, so c still holds.
 
 
-@pytest.mark.parametrize("key", ["rr_ms: 800", "fill_gaps: true"])
+@pytest.mark.parametrize("key", ["rr_ms: 800", "fill_gaps: true", "spoilt_slices: [2]"])
 def test_what_study_yaml_says_of_the_cine_counts_as_input(kitchen: Kitchen, key: str) -> None:
     kitchen.run()
     (kitchen.folder / "study.yaml").write_text(f"cine: {{{key}}}\n")

@@ -246,7 +246,10 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("cine: {us: lab}", "cine.us: unknown key; it belongs at the top level or under ecg"),
         ("folder: cine", "folder: unknown key; check its spelling"),
         ("patient_id: 7", r"patient_id: needs text; put it in quotes \(got 7\)"),
-        ("cine: mr", r"cine: needs keys below it \(path, timing, rr_ms, fill_gaps\) \(got 'mr'\)"),
+        (
+            "cine: mr",
+            r"cine: needs keys below it \(path, timing, rr_ms, fill_gaps, spoilt_slices\)",
+        ),
         (
             "cine: {}\necg: {}\ncine: {rr_ms: 9}",
             "line 3: cine is given a second time, after line 1",

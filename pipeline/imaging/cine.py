@@ -47,7 +47,7 @@ class Cine:
     """RR interval, averaged over the slices."""
 
     interpolated: tuple[int, ...] = ()
-    """Slices that were never acquired: the mean of their two neighbours stands in for each. They
+    """Slices never acquired, or spoilt: the mean of their two neighbours stands in for each. They
     keep the stack evenly spaced; nothing is to be measured on them."""
 
     @property
@@ -70,6 +70,9 @@ class Stack:
     timing_source: str
     left_out: tuple[str, ...]
     """What is not part of the stack, such as long-axis views: a line a series, with the reason."""
+
+    remarks: tuple[str, ...] = ()
+    """What the files leave open, and a person must know before the products are used."""
 
 
 def stack_frames(

@@ -25,6 +25,9 @@ SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
 VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
 
+SAME_PLACE_MM = 0.5
+"""By which a header's two placements may differ: less than a pixel."""
+
 OBLONG = 4
 """With more slices than this times the columns or rows, the axes are in another order."""
 
@@ -73,6 +76,11 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         phases, or no usable timing.
     """
     image = _load(path)
+    if len(image.shape) > 4 and 1 in image.shape:
+        raise InputError(
+            f"{path}: its shape is {image.shape}; store it without the axes of length 1, as "
+            "(columns, rows, slices, phases)"
+        )
     if len(image.shape) != 4:
         raise InputError(
             f"{path}: is not a cine, its shape is {image.shape}; 4D is needed: if this is one of "
@@ -106,7 +114,7 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         phases,
         float(own_rr_ms.mean()) / 1000,
     )
-    return Stack(cine, triggers, own_rr_ms, source, ())
+    return Stack(cine, triggers, own_rr_ms, source, (), _doubts_of_place(image))
 
 
 def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis, ...]:
@@ -189,6 +197,29 @@ def _right_angled_affine(image: Any, path: Path) -> Float:
             "with axes at right angles"
         )
     return affine
+
+
+def _doubts_of_place(image: Any) -> tuple[str, ...]:
+    """What the header's two placements leave open, in words."""
+    by_sform, sform = image.get_sform(coded=True)
+    by_qform, qform = image.get_qform(coded=True)
+    if sform == 0 and qform == 0:
+        return (
+            "the NIfTI header places the images nowhere (its sform and qform codes are 0); they "
+            "are taken to lie about the origin, so a tracker's or planner's own coordinates do "
+            "not fit the field",
+        )
+    if sform == 0 or qform == 0:
+        return ()
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape[:3]) - 1)
+    difference = by_sform[:3] - by_qform[:3]
+    off_mm = np.linalg.norm(corners @ difference[:, :3].T + difference[:, 3], axis=1).max()
+    if off_mm <= SAME_PLACE_MM:
+        return ()
+    return (
+        f"the NIfTI header's sform and qform place the images up to {off_mm:.1f} mm apart; the "
+        "sform is taken, and other programs may take the other",
+    )
 
 
 def _timing(

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from pipeline.errors import InputError, StageError
+from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.faults import require_finite
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
@@ -96,7 +97,7 @@ def segment_cine(
     StageError
         When no heart is found, or a slice is not understood; slice and phase are named.
     """
-    _require_finite(cine)
+    require_finite(cine, "cine")
     _require_contrast(cine)
     place = locate_heart(cine)
     found = label_probability(cine, place.view, settings.most_views, progress)
@@ -119,24 +120,14 @@ def segment_cine(
     )
 
 
-def _require_finite(cine: Cine) -> None:
-    bad = ~np.isfinite(cine.intensity).all(axis=(2, 3))
-    if bad.any():
-        phase, number = np.argwhere(bad)[0]
-        raise InputError(
-            f"cine, phase {phase}, slice {number}: grey values must be finite numbers, got NaN or "
-            "infinity; export the images again"
-        )
-
-
 def _require_contrast(cine: Cine) -> None:
     blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
     if blank.any():
         phase, number = np.argwhere(blank)[0]
         raise StageError(
             f"phase {phase}, slice {number}: no heart found: all its pixels are alike; export the "
-            "images again; without this slice the stack must not close up: a gap inside it is "
-            "filled by cine.fill_gaps (DICOM), or by the mean of its neighbours"
+            f"images again, or do without this slice: cine.spoilt_slices: [{number}] in study.yaml "
+            "draws it between its neighbours"
         )
 
 
@@ -158,8 +149,8 @@ def _require_understood(
         phase, number = gaps[0]
         raise StageError(
             f"phase {phase}, slice {view.order[number + 1]}: no heart found, though the slices on "
-            "both sides show it; check this image. To do without it, draw it between its "
-            "neighbours: cine.fill_gaps without its DICOM files, in NIfTI their mean in its place"
+            "both sides show it; check this image. To do without the slice, draw it between its "
+            f"neighbours: cine.spoilt_slices: [{view.order[number + 1]}] in study.yaml"
         )
     if confidence.min() < settings.min_confidence:
         worst = np.unravel_index(confidence.argmin(), confidence.shape)
@@ -169,8 +160,8 @@ def _require_understood(
             f"phase {worst[0]}, slice {view.order[worst[1]]}: the labels are not certain enough: "
             f"confidence {confidence.min():.2f}, at least {settings.min_confidence:.2f} is needed "
             f"({len(low)} images have less, phase/slice {others}"
-            f"{' ...' if len(low) > MOST_NAMED else ''}); check them, or lower "
-            "segment.min_confidence"
+            f"{' ...' if len(low) > MOST_NAMED else ''}); check them, do without a slice inside "
+            "the stack (cine.spoilt_slices in study.yaml), or lower segment.min_confidence"
         )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Stack
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import read_ecg
+from pipeline.imaging.faults import redraw_slices, require_different_images, require_finite
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.job import Job
 from pipeline.products import write_cine
@@ -25,6 +27,12 @@ def run(job: Job) -> dict[str, Any]:
     else:
         stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
         views = read_nifti_views(job.study.long_axis, files.rr_ms)
+    where = f"{job.study.folder / 'study.yaml'}: cine.spoilt_slices"
+    stack = replace(stack, cine=redraw_slices(stack.cine, files.spoilt_slices, where))
+    require_finite(stack.cine, str(files.path))
+    copies = require_different_images(stack.cine, str(files.path))
+    for view in views:
+        require_finite(view.cine, f"long-axis view {view.name}")
     _require_ecg_as_long(job, stack)
     write_cine(job.folder, stack, views)
     cine = stack.cine
@@ -37,6 +45,7 @@ def run(job: Job) -> dict[str, Any]:
         "rr_s": round(cine.rr_s, 4),
         "timing_source": stack.timing_source,
         "left_out": list(stack.left_out),
+        "remarks": [*stack.remarks, *copies],
         "long_axis": [view.name for view in views],
     }
 

@@ -111,10 +111,11 @@ def _notes(job: Job) -> list[str]:
             "of the slices and the orientation in the file before a field is used with a tracker."
         )
     ingest = job.figures("ingest")
+    notes += [f"Of the input: {text}." for text in ingest["remarks"]]
     missing = ingest["interpolated_slices"]
     if missing:
         named = ", ".join(str(number) for number in missing)
-        notes.append(f"Not recorded, so drawn between their neighbours: slices {named}.")
+        notes.append(f"Not recorded or spoilt, so drawn between their neighbours: slices {named}.")
     for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
     for why, names in by_reason(job.figures("surface")["left_out"]).items():

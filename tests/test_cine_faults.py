@@ -1,0 +1,103 @@
+"""Images that are copies, no numbers, or spoilt: refused, told, or drawn anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.errors import InputError
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.faults import redraw_slices, require_different_images, require_finite
+
+STEP_8_MM = np.diag([1.4, 1.4, 8.0, 1.0])
+
+
+def brightness_of_slices(count: int, interpolated: tuple[int, ...] = ()) -> Cine:
+    """Slice z of phase k is z^2 + 100 k all over."""
+    value = np.arange(count, dtype=np.float32) ** 2 + 100 * np.arange(3, dtype=np.float32)[:, None]
+    pixels = value[..., None, None] * np.ones((4, 5), np.float32)
+    return Cine(pixels, STEP_8_MM, np.arange(3) / 3, 0.8, interpolated)
+
+
+def test_spoilt_slices_are_the_mean_of_their_neighbours_in_every_phase() -> None:
+    before = brightness_of_slices(8, (6,))
+    found = redraw_slices(before, (2, 4), "study.yaml")
+    assert found.interpolated == (2, 4, 6)
+    np.testing.assert_allclose(
+        found.intensity[1, :, 0, 0], [100, 101, 105, 109, 117, 125, 136, 149]
+    )
+    assert before.intensity[1, 2, 0, 0] == 104
+    assert redraw_slices(before, (), "study.yaml") is before
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [
+        ((8,), "no slice 8; the stack has slices 0 to 7"),
+        ((-1,), "no slice -1"),
+        ((0,), "slice 0 is the stack's outermost"),
+        ((7,), "slice 7 is the stack's outermost"),
+        ((2, 3), "slice 2 has a neighbour that is spoilt"),
+        ((5,), "slice 5 has a neighbour that is spoilt or missing"),
+    ],
+)
+def test_spoilt_slices_that_nothing_can_stand_in_for_are_refused(spoilt, words) -> None:
+    with pytest.raises(InputError, match=f"here: {words}"):
+        redraw_slices(brightness_of_slices(8, (6,)), spoilt, "here")
+
+
+def test_a_spoilt_slice_is_not_bridged_over_a_wide_gap() -> None:
+    wide = replace(brightness_of_slices(5), mr_from_index=np.diag([1.4, 1.4, 13.0, 1.0]))
+    with pytest.raises(InputError, match=r"slice 2 lie 26.0 mm apart, at most 25 mm"):
+        redraw_slices(wide, (2,), "here")
+
+
+def noisy(phases: int = 4, slices: int = 5) -> Cine:
+    pixels = np.random.default_rng(3).normal(100, 5, (phases, slices, 6, 7)).astype(np.float32)
+    return Cine(pixels, STEP_8_MM, np.arange(phases) / phases, 0.8)
+
+
+def test_different_images_are_let_pass() -> None:
+    assert require_different_images(noisy(), "here") == ()
+
+
+def test_a_slice_that_is_a_copy_is_named_and_may_be_given_up() -> None:
+    cine = noisy()
+    cine.intensity[:, 3] = cine.intensity[:, 1]
+    words = r"here: slices 1 and 3 show the same images.*cine\.spoilt_slices: \[3\]"
+    with pytest.raises(InputError, match=words):
+        require_different_images(cine, "here")
+    assert require_different_images(redraw_slices(cine, (3,), "study.yaml"), "here") == ()
+
+
+def test_slices_alike_in_a_single_phase_or_blank_are_no_copies() -> None:
+    """Padding is blank; what a network makes of that is not for the reader to say."""
+    cine = noisy()
+    cine.intensity[0, 3] = cine.intensity[0, 1]
+    cine.intensity[:, [0, 4]] = 0
+    assert require_different_images(cine, "here") == ()
+
+
+def test_phases_that_are_copies_are_told() -> None:
+    cine = noisy()
+    cine.intensity[2:] = cine.intensity[1]
+    words = "phase {} shows the same images as phase 1 in all slices"
+    assert require_different_images(cine, "here") == (words.format(2), words.format(3))
+
+
+def test_a_heart_that_never_moves_is_refused() -> None:
+    """As two files of which one was copied from the other."""
+    cine = noisy(phases=2)
+    cine.intensity[1] = cine.intensity[0]
+    with pytest.raises(InputError, match="here: all phases show the same images"):
+        require_different_images(cine, "here")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_no_numbers_are_named_by_place(value: float) -> None:
+    cine = noisy()
+    cine.intensity[2, 4, 1, 1] = value
+    with pytest.raises(InputError, match=r"here, phase 2, slice 4: grey values must be finite"):
+        require_finite(cine, "here")
