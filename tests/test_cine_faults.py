@@ -9,7 +9,12 @@ import pytest
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.faults import redraw_slices, require_different_images, require_finite
+from pipeline.imaging.faults import (
+    doubts_of_order,
+    redraw_slices,
+    require_different_images,
+    require_finite,
+)
 
 STEP_8_MM = np.diag([1.4, 1.4, 8.0, 1.0])
 
@@ -101,3 +106,52 @@ def test_values_that_are_no_numbers_are_named_by_place(value: float) -> None:
     cine.intensity[2, 4, 1, 1] = value
     with pytest.raises(InputError, match=r"here, phase 2, slice 4: grey values must be finite"):
         require_finite(cine, "here")
+
+
+def beating_ball(phases: int = 20, slices: int = 12) -> Cine:
+    """A bright ball off the middle, whose radius follows the beat, in a chest, with noise."""
+    rng = np.random.default_rng(5)
+    z, y, x = np.mgrid[:slices, :64, :64].astype(float)
+    chest = 40.0 * (np.hypot((x - 32) / 28, (y - 32) / (14 + z)) < 1)
+    beat = np.sin(np.pi * np.arange(phases) / phases) ** 2 + 0.2 * np.arange(phases) / phases
+    radius = 16 - 6 * beat[:, None, None, None]
+    ball = np.sqrt((x - 26) ** 2 + (y - 36) ** 2 + (8 * (z - 5) / 3) ** 2)[None] < radius
+    pixels = chest + 60 * ball + rng.normal(0, 3, ball.shape)
+    return Cine(pixels.astype(np.float32), STEP_8_MM, np.arange(phases) / phases, 0.8)
+
+
+def by_name(count: int) -> list[int]:
+    """0, 1, 10, 11, 2, ...: as files without leading zeros are sorted."""
+    return sorted(range(count), key=str)
+
+
+def test_images_in_their_order_raise_no_doubt() -> None:
+    cine = beating_ball()
+    assert doubts_of_order(cine) == ()
+    assert doubts_of_order(replace(cine, intensity=cine.intensity[:, ::-1])) == ()
+    # Which phase comes first is not for the images to say.
+    assert doubts_of_order(replace(cine, intensity=np.roll(cine.intensity, 7, axis=0))) == ()
+
+
+INTERLEAVED = [*range(0, 12, 2), *range(1, 12, 2)]
+SWAPPED = [0, 1, 2, 3, 8, 5, 6, 7, 4, 9, 10, 11]
+
+
+@pytest.mark.parametrize("order", [by_name(12), SWAPPED, INTERLEAVED])
+def test_slices_out_of_order_are_told_with_their_order(order: list[int]) -> None:
+    cine = beating_ball()
+    (told,) = doubts_of_order(replace(cine, intensity=cine.intensity[:, order]))
+    right = " ".join(str(order.index(number)) for number in range(12))
+    assert told.startswith(f"slices look as if their order were {right};")
+
+
+def test_phases_sorted_by_name_are_told() -> None:
+    cine = beating_ball()
+    (told,) = doubts_of_order(replace(cine, intensity=cine.intensity[by_name(20)]))
+    assert told.startswith("phases look as if their order were 0 ")
+
+
+def test_few_phases_and_volumes_are_not_judged() -> None:
+    cine = beating_ball(phases=12, slices=61)
+    images = cine.intensity[by_name(12)][:, by_name(61)]
+    assert doubts_of_order(replace(cine, intensity=images)) == ()

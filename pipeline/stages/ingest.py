@@ -9,7 +9,12 @@ from pipeline.errors import InputError
 from pipeline.imaging.cine import Stack
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import read_ecg
-from pipeline.imaging.faults import redraw_slices, require_different_images, require_finite
+from pipeline.imaging.faults import (
+    doubts_of_order,
+    redraw_slices,
+    require_different_images,
+    require_finite,
+)
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.job import Job
 from pipeline.products import write_cine
@@ -45,7 +50,7 @@ def run(job: Job) -> dict[str, Any]:
         "rr_s": round(cine.rr_s, 4),
         "timing_source": stack.timing_source,
         "left_out": list(stack.left_out),
-        "remarks": [*stack.remarks, *copies],
+        "remarks": [*stack.remarks, *copies, *doubts_of_order(stack.cine)],
         "long_axis": [view.name for view in views],
     }
 
