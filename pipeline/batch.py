@@ -50,10 +50,11 @@ def run_batch(
     out: Path,
     workers: int,
     config: Path | None,
-    ended: Callable[[str, str, float], None],
+    ended: Callable[[Outcome, int, int], None],
 ) -> list[Outcome]:
     """Run every study below ``studies``; write ``out/batch.csv``; return outcomes by name.
 
+    ``ended`` is told of each that has ended, how many have, and of how many.
     Folders that are no study are listed among the outcomes, but for hidden ones and ``out``.
 
     Raises
@@ -75,8 +76,8 @@ def run_batch(
         waiting = [pool.submit(_run_one, folder, out, config) for folder in folders]
         for finished in as_completed(waiting):
             outcome = finished.result()
-            ended(outcome.patient, outcome.status, outcome.seconds)
             outcomes.append(outcome)
+            ended(outcome, len(outcomes), len(folders))
     outcomes += _no_studies(studies, folders, out)
     outcomes.sort(key=lambda outcome: outcome.patient)
     with readable_write_errors(out):

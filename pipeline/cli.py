@@ -193,7 +193,7 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     workers
         How many studies to run at a time.
     """
-    from pipeline.batch import NO_STUDY, run_batch, table
+    from pipeline.batch import NO_STUDY, Outcome, run_batch, table
     from pipeline.config import read_settings
 
     if workers < 1:
@@ -201,8 +201,9 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     # What is wrong with the settings is wrong for every study, and is said once.
     read_settings(config)
 
-    def ended(name: str, status: str, seconds: float) -> None:
-        print(f"{name:24s} {status} in {seconds:.1f} s", file=sys.stderr, flush=True)
+    def ended(one: Outcome, done: int, total: int) -> None:
+        said = f"{done}/{total} {one.patient:24s} {one.status} in {one.seconds:.1f} s"
+        print(said, file=sys.stderr, flush=True)
 
     outcomes = run_batch(studies, out, workers, config, ended)
     print(table(outcomes))
