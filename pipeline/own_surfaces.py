@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.sparse.csgraph import connected_components
 
 from pipeline import __version__
 from pipeline.config import Settings
@@ -22,9 +23,11 @@ from pipeline.field.distance import require_closed
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
 from pipeline.field.metadata import require_name
 from pipeline.field.reader import ForceField
+from pipeline.geometry import Float, Surface
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
 from pipeline.surface.crossings import crossing_triangles
+from pipeline.surface.mesh import adjacency
 from pipeline.validation import describe_validation
 
 Row = tuple[float, float, float, float]
@@ -99,7 +102,7 @@ def bake_own_surfaces(
                 progress=progress,
             )
         except StageError as error:
-            raise StageError(_with_crossings(str(error), own.surfaces)) from error
+            raise StageError(_with_cause(str(error), own.surfaces)) from error
     return field
 
 
@@ -113,8 +116,8 @@ def fixture_lines(field: Path) -> list[str]:
     ]
 
 
-def _with_crossings(message: str, surfaces: Mapping[str, SurfaceSeries]) -> str:
-    """Why a field failed, and where a surface passes through itself: that leaves no inside."""
+def _with_cause(message: str, surfaces: Mapping[str, SurfaceSeries]) -> str:
+    """Why a field failed, and where a surface has no inside that a sign could tell."""
     for name, series in surfaces.items():
         for phase, surface in enumerate(series.surfaces):
             crossing = crossing_triangles(surface.vertices_mm, surface.triangles)
@@ -126,7 +129,44 @@ def _with_crossings(message: str, surfaces: Mapping[str, SurfaceSeries]) -> str:
                     f"{np.count_nonzero(crossing)} triangles, one at {x} {y} {z} mm), so that no "
                     "spacing will do: unite its parts, or remesh it"
                 )
+            shell = _wrong_shell(surface)
+            if shell:
+                return f"{message}. But no spacing will do: {name} in phase {phase} has {shell}"
     return message
+
+
+def _wrong_shell(surface: Surface) -> str:
+    """A shell that does not bound what the others leave: inside one, facing the same way."""
+    count, part = connected_components(
+        adjacency(surface.triangles, len(surface.vertices_mm)), directed=False
+    )
+    for number in range(count if count > 1 else 0):
+        own = part[surface.triangles[:, 0]] == number
+        if not own.any():
+            continue
+        outwards = Surface(surface.vertices_mm, surface.triangles[own]).volume_mm3() > 0
+        place_mm = surface.vertices_mm[surface.triangles[own][0, 0]]
+        corners_mm = surface.vertices_mm[surface.triangles[~own]] - place_mm
+        within = round(_winding_number(corners_mm))
+        if within != (0 if outwards else 1):
+            facing = "outwards, within another" if outwards else "inwards, within no other"
+            x, y, z = (f"{one:.1f}" for one in place_mm)
+            return (
+                f"a shell (at {x} {y} {z} mm) that faces {facing}: take it out, or turn its normals"
+            )
+    return ""
+
+
+def _winding_number(corners_mm: Float) -> float:
+    """How often triangles ``(n, 3, 3)`` wind around the origin.
+
+    Solid angles by van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30:125-126 (1983).
+    """
+    a, b, c = corners_mm.transpose(1, 0, 2)
+    p, q, r = (np.linalg.norm(one, axis=1) for one in (a, b, c))
+    triple = (a * np.cross(b, c)).sum(axis=1)
+    around = p * q * r + (a * b).sum(axis=1) * r + (a * c).sum(axis=1) * q + (b * c).sum(axis=1) * p
+    return float(np.arctan2(triple, around).sum() / (2 * np.pi))
 
 
 def measure_field(

@@ -15,12 +15,13 @@ from surface_shapes import ellipsoid, voxel_centres
 from pipeline.config import Settings
 from pipeline.errors import StageError
 from pipeline.field import BakeSettings
+from pipeline.field.fixture import Bounds
 from pipeline.geometry import Float, Surface
 from pipeline.meshes import write_vtp
 from pipeline.own_surfaces import bake_own_surfaces
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.level_set import LevelSet, smooth_level_set
-from pipeline.surface.mesh import adjacency, extract_surface, uncrossed
+from pipeline.surface.mesh import adjacency, extract_surface, flipped, uncrossed
 
 BESIDE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
 TWO = np.array([[0, 1, 2], [3, 4, 5]])
@@ -106,13 +107,16 @@ def test_a_sound_mesh_is_returned_as_it_is():
     assert uncrossed(surface.vertices_mm, surface.triangles, level) is surface.vertices_mm
 
 
-def test_a_bake_that_fails_names_the_surface_that_passes_through_itself(tmp_path: Path) -> None:
-    """Two balls that overlap: inside both, no distance has the sign of the outer face."""
-    one, other = sphere(15, 3), sphere(15, 3, (18, 0.3, 0.7))
-    both = Surface(
+def together(one: Surface, other: Surface) -> Surface:
+    return Surface(
         np.concatenate([one.vertices_mm, other.vertices_mm]),
         np.concatenate([one.triangles, other.triangles + len(one.vertices_mm)]),
     )
+
+
+def test_a_bake_that_fails_names_the_surface_that_passes_through_itself(tmp_path: Path) -> None:
+    """Two balls that overlap: inside both, no distance has the sign of the outer face."""
+    both = together(sphere(15, 3), sphere(15, 3, (18, 0.3, 0.7)))
     folder = tmp_path / "own"
     folder.mkdir()
     write_vtp(folder / "lv.vtp", both)
@@ -122,3 +126,26 @@ def test_a_bake_that_fails_names_the_surface_that_passes_through_itself(tmp_path
     ):
         bake_own_surfaces(folder, tmp_path / "out", Settings(bake=BakeSettings(spacing_mm=3.0)))
     assert not (tmp_path / "out" / "field.zarr").exists()
+
+
+INNER = sphere(8, 3, (0, 1, 2))
+COARSE = Settings(bake=BakeSettings(spacing_mm=3.0, bounds=Bounds(surface_error_p99_spacings=1)))
+
+
+@pytest.mark.parametrize(
+    ("inner", "words"),
+    [
+        (INNER, r"lv in phase 0 has a shell \(at .* mm\) that faces outwards, within another"),
+        (flipped(sphere(8, 3, (60, 0, 0))), "faces inwards, within no other: take it out, or turn"),
+    ],
+)
+def test_a_bake_that_fails_names_the_shell_that_faces_the_wrong_way(inner, words, tmp_path) -> None:
+    write_vtp(tmp_path / "lv.vtp", together(sphere(20, 3), inner))
+    with pytest.raises(StageError, match=words):
+        bake_own_surfaces(tmp_path, tmp_path / "out", COARSE)
+
+
+@pytest.mark.parametrize("inner", [flipped(INNER), sphere(8, 3, (60, 0, 0))])
+def test_a_hollow_body_and_one_of_two_parts_are_baked(inner: Surface, tmp_path: Path) -> None:
+    write_vtp(tmp_path / "lv.vtp", together(sphere(20, 3), inner))
+    assert bake_own_surfaces(tmp_path, tmp_path / "out", COARSE).exists()
