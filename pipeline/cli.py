@@ -173,12 +173,12 @@ def bake(
         return 0
     assert surfaces is not None
     from pipeline.config import read_settings
-    from pipeline.own_surfaces import bake_own_surfaces, fixture_lines
+    from pipeline.own_surfaces import bake_own_surfaces, what_was_baked
 
     settings = read_settings(config, own_surfaces=True)
     field = bake_own_surfaces(surfaces, out, settings, Console().progress)
     print(f"field     {field}")
-    print("\n".join(f"fixture   {line}" for line in fixture_lines(field)))
+    print("\n".join(what_was_baked(field)))
     return 0
 
 
@@ -368,6 +368,8 @@ def paper(out: Path, /, options: Annotated[PaperOptions, Parameter(name="*")] = 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
+    # What is half-done is cleared away, as when a person interrupts.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return _guarded(lambda: app(arguments, exit_on_error=False, print_error=True))
 
 
@@ -389,6 +391,6 @@ def _guarded(command: Callable[[], Any]) -> int:
             print(f"note: {note}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("interrupted; finished stages are kept", file=sys.stderr)
+        print("interrupted; what is finished is kept", file=sys.stderr)
         return 130
     return code if isinstance(code, int) else 0

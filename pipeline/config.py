@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import DEFAULT_FIXTURES, BakeSettings, Fixture
@@ -29,11 +28,12 @@ class Settings(BaseModel):
     fixtures: dict[str, Fixture] = DEFAULT_FIXTURES
     """Fixtures by name; giving any replaces the default set."""
 
-    @model_validator(mode="after")
-    def _has_a_fixture(self) -> Self:
-        if not self.fixtures:
+    @field_validator("fixtures")
+    @classmethod
+    def _has_a_fixture(cls, fixtures: dict[str, Fixture]) -> dict[str, Fixture]:
+        if not fixtures:
             raise ValueError("at least one fixture is needed; leave the key out for the default")
-        return self
+        return fixtures
 
 
 def read_settings(path: Path | None, *, own_surfaces: bool = False) -> Settings:

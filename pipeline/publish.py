@@ -38,6 +38,9 @@ LIBRARIES = (
 )
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+REFUSED = {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT
+}  # fmt: skip
 
 PACKAGE = Path(__file__).parent
 
@@ -75,7 +78,7 @@ def readable_write_errors(target: Path) -> Iterator[None]:
                 f"{target}: the disk is full ({error.strerror}); free some space or choose "
                 "another --out, then run again: finished stages are kept"
             ) from error
-        if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST}:
+        if error.errno in REFUSED:
             raise InputError(
                 f"{target}: cannot be written ({error.strerror}: {error.filename}); "
                 "choose a folder that you may write in"

@@ -156,6 +156,9 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
                 "settings; do not use them for this one"
             )
         raise
+    except KeyboardInterrupt:
+        _record(run, "interrupted")
+        raise
     seconds = time.perf_counter() - clock
     measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}
     _note(run, stage.name, "done", figures, key, measured)

@@ -6,6 +6,7 @@ elsewhere, key by key. Nothing here reads an image.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +21,8 @@ from pipeline.yaml_files import read_yaml
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 DICOM_ENDINGS = (".dcm", ".ima", "")
 WFDB_ENDINGS = (".hea", ".dat")
+
+PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -61,7 +64,7 @@ class UltrasoundFiles(_Section):
 class Described(_Section):
     """What ``study.yaml`` may say."""
 
-    patient_id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    patient_id: str = Field(pattern=f"^{PATIENT_ID}$")
     cine: CineFiles
     ecg: EcgFiles = EcgFiles()
     us: UltrasoundFiles | None = None
@@ -158,6 +161,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
     """What the folders hold, each key that is given in its place."""
+    if "patient_id" not in given and not re.fullmatch(PATIENT_ID, folder.name):
+        raise InputError(
+            f"{folder}: its name is no patient id, which has letters, digits and '_ . -' alone, a "
+            "letter or digit first; rename the folder, or give patient_id in study.yaml"
+        )
     content = {"patient_id": folder.name, **given}
     for name, found in (("ecg", _found_ecg(folder)), ("us", _found_us(folder))):
         content[name] = _overridden(found, given[name]) if name in given else found
@@ -205,7 +213,7 @@ def _found_cine(folder: Path, given: Any) -> Any:
     if not isinstance(path, str):
         return given
     cine = folder / path
-    images = [one for one in _files(cine) if one.name.endswith(NIFTI_ENDINGS)]
+    images = [one for one in _files(cine) if one.name.lower().endswith(NIFTI_ENDINGS)]
     if len(images) > 1:
         raise InputError(
             f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}), one 4D "
@@ -214,6 +222,11 @@ def _found_cine(folder: Path, given: Any) -> Any:
         )
     if images and cine.is_dir():
         _require_no_dicom(cine, images[0])
+    if not images and (cine / "timing.json").exists():
+        raise InputError(
+            f"{cine}: holds timing.json, but no NIfTI file (.nii, .nii.gz) that it would be of; "
+            "put that beside it, or, of DICOM files, take timing.json out"
+        )
     timing = images[0].with_name("timing.json") if images else None
     found = {"timing": timing if timing and timing.exists() else None}
     return {**found, **given, "path": images[0] if images else cine}
@@ -222,7 +235,7 @@ def _found_cine(folder: Path, given: Any) -> Any:
 def _require_no_dicom(cine: Path, image: Path) -> None:
     """Refuse a folder in which one NIfTI file would stand for what may be another cine."""
     for one in _files(cine):
-        if one.suffix.lower() in DICOM_ENDINGS and not one.name.startswith("."):
+        if one.suffix.lower() in DICOM_ENDINGS:
             raise InputError(
                 f"{cine}: holds {image.name}, a NIfTI file, and {one.name}, as of DICOM; keep "
                 "one sort there, or name the NIfTI file under cine.path in study.yaml"
@@ -234,7 +247,8 @@ def _found_ecg(folder: Path) -> dict[str, Any]:
 
 
 def _found_us(folder: Path) -> dict[str, Any] | None:
-    sweeps = tuple(sorted((folder / "us").glob("*.mh[ad]")))
+    found = (folder / "us").glob("*.mh[ad]")
+    sweeps = tuple(sorted(path for path in found if not path.name.startswith(".")))
     return {"sweeps": sweeps} if sweeps else None
 
 
@@ -255,7 +269,7 @@ def _require_signals(record: list[Path]) -> None:
 
 def _require_nothing_in(us: Path) -> None:
     """Refuse files that a user took for sweeps, and that nothing would read."""
-    others = [one for one in _files(us) if not one.name.startswith(".")]
+    others = _files(us)
     if others:
         raise InputError(
             f"{us}: holds no sweep but {others[0].name}; sweeps are .mha or .mhd files directly in "
@@ -310,7 +324,7 @@ def _require_files(study: Study) -> None:
 def _require_what_fits_the_cine(study: Study) -> None:
     """Refuse what is meant for DICOM files beside NIfTI, and the reverse: it would do nothing."""
     cine, described = study.cine, study.folder / "study.yaml"
-    if cine.path.is_file() and not cine.path.name.endswith(NIFTI_ENDINGS):
+    if cine.path.is_file() and not cine.path.name.lower().endswith(NIFTI_ENDINGS):
         raise InputError(
             f"{described}: cine.path: {cine.path} is no NIfTI file (.nii, .nii.gz); of DICOM "
             "files, even of a single one, name the folder"
@@ -334,6 +348,8 @@ def _require_what_fits_the_cine(study: Study) -> None:
 
 
 def _files(path: Path) -> list[Path]:
+    """A file, or all in a folder but those whose names begin with a dot, which systems leave."""
     if path.is_dir():
-        return sorted(one for one in path.rglob("*") if one.is_file())
+        found = path.rglob("*")
+        return sorted(one for one in found if one.is_file() and not one.name.startswith("."))
     return [path] if path.is_file() else []

@@ -37,8 +37,10 @@ def describe_validation(
             given = f", got {one['ctx']['tag']!r}" if "tag" in one["ctx"] else ""
             known = one["ctx"].get("expected_tags", "")
             message = f"needs `{kind}:`, one of {known}{given}" if known else f"needs `{kind}:`"
-        elif one["type"] == "string_type" and isinstance(one["input"], int | float):
+        elif one["type"] == "string_type" and not isinstance(one["input"], dict | list | None):
             message = "needs text; put it in quotes"
+        elif one["type"] == "string_pattern_mismatch":
+            message = "needs letters, digits and '_ . -' alone, a letter or digit first"
         came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
         lines.append(f"{where}: {key}: {message}{came}")
     return "\n".join(lines)

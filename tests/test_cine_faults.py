@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import nibabel
 import numpy as np
 import pytest
+from cine_files import write_dicom
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Cine
+from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
     require_different_images,
     require_finite,
+    require_room_for_a_heart,
 )
+from pipeline.imaging.nifti import read_nifti_cine
+from pipeline.study import open_study
 
 STEP_8_MM = np.diag([1.4, 1.4, 8.0, 1.0])
 
@@ -155,3 +163,101 @@ def test_few_phases_and_volumes_are_not_judged() -> None:
     cine = beating_ball(phases=12, slices=61)
     images = cine.intensity[by_name(12)][:, by_name(61)]
     assert doubts_of_order(replace(cine, intensity=images)) == ()
+
+
+def told_by_half(**fields: Any) -> Any:
+    """Fields of the first two slices (first of each pair) and of the others."""
+
+    def change(data: Any, number: int, phase: int) -> bool:
+        for name, values in fields.items():
+            setattr(data, name, values[number >= 2])
+        return True
+
+    return change
+
+
+def test_slices_of_two_patients_are_no_stack(tmp_path: Path) -> None:
+    write_dicom(tmp_path, told_by_half(PatientID=("A17", "B4")))
+    with pytest.raises(InputError, match=r"\.dcm and .*\.dcm have different PatientIDs"):
+        read_dicom_study(tmp_path)
+
+
+def test_slices_in_two_frames_of_reference_are_told(tmp_path: Path) -> None:
+    write_dicom(tmp_path, told_by_half(FrameOfReferenceUID=("1.2.3", "1.2.4")))
+    (remark,) = read_dicom_study(tmp_path)[0].remarks
+    assert "different FrameOfReferenceUIDs: if the patient was moved" in remark
+
+
+def test_images_that_do_not_tell_their_patient_are_taken_for_the_same(tmp_path: Path) -> None:
+    write_dicom(tmp_path, told_by_half(PatientID=("A17", ""), FrameOfReferenceUID=("", "1.2.4")))
+    assert read_dicom_study(tmp_path)[0].remarks == ()
+
+
+def saved(path: Path) -> Path:
+    """A cine of noise as NIfTI."""
+    pixels = np.random.default_rng(2).integers(0, 999, (64, 60, 4, 5)).astype(np.int16)
+    image = nibabel.Nifti1Image(pixels, np.diag([1.5, 1.5, 8, 1]))
+    image.header.set_xyzt_units("mm", "msec")
+    image.header.set_zooms((1.5, 1.5, 8, 160))
+    nibabel.save(image, path)
+    return path
+
+
+def test_images_too_small_for_a_heart_are_refused() -> None:
+    cine = beating_ball()
+    require_room_for_a_heart(cine, "here")
+    small = replace(cine, mr_from_index=np.diag([0.14, 0.14, 0.8, 1.0]))
+    with pytest.raises(InputError, match=r"here: its images measure 9 x 9 mm.*in centimetres\?"):
+        require_room_for_a_heart(small, "here")
+
+
+def test_a_damaged_file_is_named_with_what_to_do(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cine.nii.gz")
+    content = bytearray(path.read_bytes())
+    for place in range(len(content) // 2, len(content) // 2 + 400):
+        content[place] ^= 255
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"cine\.nii\.gz: its voxels cannot be read.*--from STAGE"):
+        read_nifti_cine(path, None)
+
+
+def test_timing_as_windows_writes_it_is_read(tmp_path: Path) -> None:
+    timing = tmp_path / "timing.json"
+    times = '{"trigger_times_ms": [0, 160, 320, 480, 640], "rr_ms": 800}'
+    timing.write_text(times, encoding="utf-8-sig")
+    stack = read_nifti_cine(saved(tmp_path / "cine.nii"), timing)
+    assert stack.trigger_times_ms[3].tolist() == [0, 160, 320, 480, 640]
+
+
+def test_an_rr_interval_of_ones_own_that_does_not_fit_is_named(tmp_path: Path) -> None:
+    timing = tmp_path / "timing.json"
+    timing.write_text('{"trigger_times_ms": [0, 160, 320, 480, 640], "rr_ms": 800}')
+    with pytest.raises(InputError, match=r"timing\.json, with cine\.rr_ms 500: trigger times"):
+        read_nifti_cine(saved(tmp_path / "cine.nii"), timing, 500.0)
+
+
+def study_of(folder: Path, *names: str) -> Path:
+    """A study of empty files."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def test_files_that_systems_leave_are_not_taken_for_images(tmp_path: Path) -> None:
+    folder = study_of(tmp_path, "cine/a.dcm", "ecg/us.csv", "us/left.mha")
+    study_of(folder, "cine/._a.dcm", "cine/._x.nii.gz", "cine/.DS_Store", "us/._left.mha")
+    study = open_study(folder)
+    assert study.cine.path == folder / "cine"
+    assert study.us is not None
+    assert [path.name for path in study.us.sweeps] == ["left.mha"]
+    assert [path.name for path in study.input_files()["cine"]] == ["a.dcm"]
+
+
+def test_endings_may_be_capitals(tmp_path: Path) -> None:
+    assert open_study(study_of(tmp_path, "cine/CINE.NII.GZ")).cine.path.name == "CINE.NII.GZ"
+
+
+def test_timing_without_its_images_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds timing\.json, but no NIfTI file"):
+        open_study(study_of(tmp_path, "cine/timing.json"))

@@ -240,6 +240,9 @@ def test_the_summary_says_what_the_registration_is_worth(
     stage = {"status": "done", "figures": {**figures, "calibration": calibration}}
     record = {"status": "done", "stages": {"register": stage}}
     assert f"verdict   registration {line}" in summary(record, tmp_path).splitlines()
+    assert "clock" not in summary(record, tmp_path)
+    stage["figures"] |= {"us_clock_applied_s": -0.3}
+    assert "clock     ultrasound 0.300 s behind its ECG, which" in summary(record, tmp_path)
     stage["status"] = "stale"
     assert "verdict" not in summary(record, tmp_path)
     stage.update(status="skipped", cause="no tracked ultrasound", figures={})
@@ -261,7 +264,9 @@ def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Pa
         "lowest_confidence": 0.66,
         "least_certain": {"phase": 1, "slice": 4},
         "cut_off": {"left atrium": {"9": 2}, "aorta": {"9": 2}, "left ventricle": {"0": 1}},
+        "volumes_ml": {"lv_myocardium": [81.0, 136.0]},
     }
+    ingest["remarks"] = ["phase 1 shows the same images as phase 0 in all slices"]
     stages = {
         "ingest": {"status": "done", "figures": ingest},
         "segment": {"status": "done", "figures": segment},
@@ -269,6 +274,11 @@ def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Pa
     said = summary({"status": "done", "stages": stages}, tmp_path).splitlines()
     assert any(line.startswith("timing    two phases evenly over a beat of 2 s") for line in said)
     assert any(line.startswith("doubtful  labels of slice 4 in phase 1, whose") for line in said)
+    assert any(line.startswith("input     phase 1 shows the same") for line in said)
+    told = "doubtful  labels: of heart muscle phase 0 has 81 ml and phase 1 136 ml"
+    assert any(line.startswith(told) for line in said)
+    segment["volumes_ml"] = {"lv_myocardium": [100.0, 129.0]}
+    assert "heart muscle" not in summary({"status": "done", "stages": stages}, tmp_path)
     cut = [line for line in said if line.startswith("cut off")]
     assert len(cut) == 2
     assert cut[0].startswith("cut off   left atrium, aorta at slice 9 in 2 of 2 phases")
@@ -286,7 +296,7 @@ def test_an_interruption_says_what_is_kept(
 
     monkeypatch.setattr("pipeline.cli._run", interrupted)
     assert main(["run", str(tmp_path), "--out", str(tmp_path / "out")]) == 130
-    assert "interrupted; finished stages are kept" in capsys.readouterr().err
+    assert "interrupted; what is finished is kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

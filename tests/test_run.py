@@ -210,6 +210,7 @@ def test_a_failing_stage_leaves_its_earlier_product(kitchen: Kitchen) -> None:
         kitchen.run()
     assert kitchen.text("a") == before
     assert not list((kitchen.out / "p1").glob(f".*{PARTIAL}*"))
+    assert kitchen.record()["status"] == "interrupted"
 
 
 def test_a_skipped_stage_says_why_and_removes_what_it_once_made(kitchen: Kitchen) -> None:

@@ -230,8 +230,10 @@ def test_long_axis_views_beside_dicom_files_are_not_overlooked(tmp_path: Path) -
 
 def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None:
     study_folder(tmp_path).rename(tmp_path / "patient 7")
-    with pytest.raises(InputError, match=r"patient_id: .*'patient 7'"):
+    with pytest.raises(InputError, match=r"patient 7: its name is no patient id.*rename"):
         open_study(tmp_path / "patient 7")
+    (tmp_path / "patient 7" / "study.yaml").write_text("patient_id: p7\n")
+    assert open_study(tmp_path / "patient 7").patient_id == "p7"
 
 
 @pytest.mark.parametrize(
@@ -246,6 +248,8 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("cine: {us: lab}", "cine.us: unknown key; it belongs at the top level or under ecg"),
         ("folder: cine", "folder: unknown key; check its spelling"),
         ("patient_id: 7", r"patient_id: needs text; put it in quotes \(got 7\)"),
+        ("patient_id: 2024-01-02", "patient_id: needs text; put it in quotes"),
+        ("patient_id: A 7", "patient_id: needs letters, digits and '_ . -' alone"),
         (
             "cine: mr",
             r"cine: needs keys below it \(path, timing, rr_ms, fill_gaps, spoilt_slices\)",

@@ -13,7 +13,7 @@ from surface_shapes import crossing_triangles as independent
 from surface_shapes import ellipsoid, voxel_centres
 
 from pipeline.config import Settings
-from pipeline.errors import StageError
+from pipeline.errors import InputError
 from pipeline.field import BakeSettings
 from pipeline.field.fixture import Bounds
 from pipeline.geometry import Float, Surface
@@ -122,7 +122,7 @@ def test_a_bake_that_fails_names_the_surface_that_passes_through_itself(tmp_path
     write_vtp(folder / "lv.vtp", both)
     # They meet half-way, at x = 9 mm, to within a triangle's size and the tilt of that plane.
     with pytest.raises(
-        StageError, match=r"lv passes through itself in phase 0 .* at ([789]|1[01])\."
+        InputError, match=r"lv passes through itself in phase 0 .* at ([789]|1[01])\."
     ):
         bake_own_surfaces(folder, tmp_path / "out", Settings(bake=BakeSettings(spacing_mm=3.0)))
     assert not (tmp_path / "out" / "field.zarr").exists()
@@ -141,7 +141,7 @@ COARSE = Settings(bake=BakeSettings(spacing_mm=3.0, bounds=Bounds(surface_error_
 )
 def test_a_bake_that_fails_names_the_shell_that_faces_the_wrong_way(inner, words, tmp_path) -> None:
     write_vtp(tmp_path / "lv.vtp", together(sphere(20, 3), inner))
-    with pytest.raises(StageError, match=words):
+    with pytest.raises(InputError, match=words):
         bake_own_surfaces(tmp_path, tmp_path / "out", COARSE)
 
 
@@ -149,3 +149,19 @@ def test_a_bake_that_fails_names_the_shell_that_faces_the_wrong_way(inner, words
 def test_a_hollow_body_and_one_of_two_parts_are_baked(inner: Surface, tmp_path: Path) -> None:
     write_vtp(tmp_path / "lv.vtp", together(sphere(20, 3), inner))
     assert bake_own_surfaces(tmp_path, tmp_path / "out", COARSE).exists()
+
+
+def test_vertices_that_are_no_numbers_are_named(tmp_path: Path) -> None:
+    ball = sphere(20, 3)
+    ball.vertices_mm[7, 1] = np.nan
+    write_vtp(tmp_path / "lv.vtp", ball)
+    with pytest.raises(InputError, match=r"lv\.vtp: has vertices that are no numbers"):
+        bake_own_surfaces(tmp_path, tmp_path / "out", COARSE)
+
+
+def test_phases_named_in_two_ways_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "lv").mkdir()
+    write_vtp(tmp_path / "lv_000.vtp", sphere(20, 3))
+    write_vtp(tmp_path / "lv" / "001.vtp", sphere(18, 3))
+    with pytest.raises(InputError, match="is of the same structure and lies elsewhere"):
+        bake_own_surfaces(tmp_path, tmp_path / "out", COARSE)

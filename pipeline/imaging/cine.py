@@ -99,11 +99,17 @@ def stack_frames(
     Raises
     ------
     InputError
-        When matrix, pixel spacing or direction differ, a slice or a phase is missing or given
+        When patient, matrix, pixel spacing or direction differ, a slice or phase lacks or is given
         twice, there are fewer than 3 slices or 2 phases, or the timing is not that of one
         heartbeat.
     """
     chosen, left_out = choose_stack(frames, where)
+    patients = _unlike(chosen, "patient")
+    if patients:
+        raise InputError(
+            f"{where}: {patients} have different PatientIDs; a stack is of one patient: take the "
+            "other's images out"
+        )
     _require_timing(chosen)
     slices, time_name = _in_time(_slices_in_order(chosen), where)
     _require_complete(slices, where)
@@ -120,7 +126,24 @@ def stack_frames(
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
-    return Stack(cine, triggers, rr_ms, source, lines)
+    return Stack(cine, triggers, rr_ms, source, lines, _doubts_of_place(chosen))
+
+
+def _unlike(frames: Sequence[Frame], name: str) -> str:
+    """Two images that tell an attribute differently, in words; empty where all that tell agree."""
+    told = [frame for frame in frames if getattr(frame, name)]
+    others = [one for one in told if getattr(one, name) != getattr(told[0], name)]
+    return f"{told[0].where} and {others[0].where}" if others else ""
+
+
+def _doubts_of_place(frames: Sequence[Frame]) -> tuple[str, ...]:
+    places = _unlike(frames, "frame_of_reference")
+    if not places:
+        return ()
+    return (
+        f"{places} have different FrameOfReferenceUIDs: if the patient was moved between them, "
+        "slices do not fit one another",
+    )
 
 
 def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:

@@ -182,6 +182,7 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
             series_uid=str(dataset.get("SeriesInstanceUID", "")),
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
             frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
+            patient=str(dataset.get("PatientID", "") or "").strip(),
         )
     except (ValueError, TypeError, IndexError) as error:
         raise InputError(

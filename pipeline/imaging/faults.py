@@ -28,6 +28,10 @@ MOST_ORDERED = 60
 """More slices are those of a volume, which is acquired as one."""
 
 ORDER_PIXELS = 64
+"""About so many pixels of the smaller side are compared."""
+
+LEAST_VIEW_MM = 60.0
+"""Sides of images that show a left ventricle with its wall."""
 
 
 def require_finite(cine: Cine, where: str) -> None:
@@ -38,6 +42,18 @@ def require_finite(cine: Cine, where: str) -> None:
         raise InputError(
             f"{where}, phase {phase}, slice {number}: grey values must be finite numbers, got NaN "
             "or infinity; export the images again"
+        )
+
+
+def require_room_for_a_heart(cine: Cine, where: str) -> None:
+    """Raise InputError where images are too small to show a heart: lengths are in another unit."""
+    rows, columns = cine.intensity.shape[2:]
+    across, down = (float(mm) for mm in cine.spacing_mm[:2] * (columns, rows))
+    if min(across, down) < LEAST_VIEW_MM:
+        raise InputError(
+            f"{where}: its images measure {across:.0f} x {down:.0f} mm, too little for a heart: at "
+            f"least {LEAST_VIEW_MM:g} mm are needed; are lengths in centimetres? Write them in "
+            "millimetres"
         )
 
 

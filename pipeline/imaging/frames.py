@@ -65,6 +65,9 @@ class Frame:
     frame_of_reference: str = ""
     """What tells apart the frames in which positions are given; empty when the file does not."""
 
+    patient: str = ""
+    """The patient's identifier; empty when the file does not tell."""
+
     @property
     def normal(self) -> Float:
         """Unit normal of the slice, right-handed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,10 @@ def read_image(path: Path) -> tuple[npt.NDArray[Any], Float]:
     image = _load(path)
     try:
         stored = np.asarray(image.dataobj)
-    except (OSError, EOFError, ValueError) as error:
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         raise InputError(
-            f"{path}: its voxels cannot be read, the file is truncated or damaged ({error})"
+            f"{path}: its voxels cannot be read, the file is truncated or damaged ({error}); copy "
+            "it again, or, where a stage made it, run that stage again (--from STAGE)"
         ) from error
     return stored.T, LPS_FROM_RAS @ _right_angled_affine(image, path)
 
@@ -107,7 +109,8 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
             "millimetres"
         )
     triggers, own_rr_ms, source = _timing(image, path, timing, rr_ms)
-    phases = common_phases(triggers, own_rr_ms, str(timing or path))
+    said = f"{timing or path}" + ("" if rr_ms is None else f", with cine.rr_ms {rr_ms:g}")
+    phases = common_phases(triggers, own_rr_ms, said)
     cine = Cine(
         np.ascontiguousarray(intensity, np.float32),
         mr_from_index,
@@ -134,7 +137,8 @@ def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis
     """
     if not folder.is_dir():
         return ()
-    paths = sorted([*folder.glob("*.nii"), *folder.glob("*.nii.gz")])
+    found = [*folder.glob("*.nii"), *folder.glob("*.nii.gz")]
+    paths = sorted(path for path in found if not path.name.startswith("."))
     read = {*paths, *(_view_timing(path) for path in paths)}
     for path in sorted(folder.iterdir()):
         if path not in read and not path.name.startswith("."):
@@ -175,7 +179,7 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
 def _load(path: Path) -> Any:
     try:
         image: Any = nibabel.load(path)
-    except (ImageFileError, OSError, EOFError) as error:
+    except (ImageFileError, OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: cannot be read as NIfTI ({error})") from error
     if image.get_data_dtype().kind == "c":
         raise InputError(f"{path}: its voxels are complex numbers; store their magnitude")
@@ -266,7 +270,7 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
         f'"rr_ms" as {slices} numbers (or one)'
     )
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(content, dict) or not {"trigger_times_ms", "rr_ms"} <= set(content):

@@ -14,7 +14,7 @@ from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
-from pipeline.imaging.faults import require_finite
+from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
@@ -93,11 +93,12 @@ def segment_cine(
     Raises
     ------
     InputError
-        When the images hold values that are not numbers.
+        When the images hold values that are not numbers, or are too small to show a heart.
     StageError
         When no heart is found, or a slice is not understood; slice and phase are named.
     """
     require_finite(cine, "cine")
+    require_room_for_a_heart(cine, "cine")
     _require_contrast(cine)
     place = locate_heart(cine)
     found = label_probability(cine, place.view, settings.most_views, progress)

@@ -22,7 +22,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
-from pipeline.summary import by_reason, cut_off_by
+from pipeline.summary import by_reason, cut_off_by, muscle_changes
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -116,6 +116,7 @@ def _notes(job: Job) -> list[str]:
     if missing:
         named = ", ".join(str(number) for number in missing)
         notes.append(f"Not recorded or spoilt, so drawn between their neighbours: slices {named}.")
+    notes += [f"Doubtful {text}." for text in muscle_changes(job.figures("segment"))]
     for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
     for why, names in by_reason(job.figures("surface")["left_out"]).items():
