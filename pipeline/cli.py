@@ -322,9 +322,8 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
 def rpeaks(record: Path, /, *, out: Path) -> int:
     """Find the R peaks of an electrocardiogram, as a stream would show them.
 
-    Writes a row for each beat: R time in seconds (on the recording's clock), kind (normal, ectopic,
-    irregular), whether the heart's phase could be relied on, the best lead, the RR interval, how
-    much the beat resembles the others, and when it became known.
+    Writes a row for each beat: R time (s, on the recording's clock), kind, whether the phase could
+    be relied on, the best lead, RR interval, likeness to other beats, and when it became known.
 
     Parameters
     ----------
@@ -334,13 +333,18 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
         CSV file to write.
     """
     from pipeline.imaging.ecg import read_ecg
-    from pipeline.registration.rhythm import read_rhythm, write_rhythm
+    from pipeline.registration.rhythm import doubt, read_rhythm, write_rhythm
 
     ecg = read_ecg(record, gaps=True)
-    beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)
+    try:
+        beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)
+    except InputError as error:
+        raise InputError(f"{record}: {error}") from error
     write_rhythm(out, beats, ecg.leads, ecg.start_s)
-    counts = {kind: sum(beat.kind == kind for beat in beats) for kind in ("ectopic", "irregular")}
-    print(f"beats     {len(beats)}, " + ", ".join(f"{n} {kind}" for kind, n in counts.items()))
+    ectopic, irregular = (sum(one.kind == k for one in beats) for k in ("ectopic", "irregular"))
+    print(f"beats     {len(beats)}, {ectopic} ectopic, {irregular} irregular")
+    if said := doubt(beats):
+        print(f"doubtful  {said}")
     print(f"table     {out}")
     return 0
 

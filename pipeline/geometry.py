@@ -39,7 +39,13 @@ def require_rigid(transform: Float, where: str) -> None:
     rotation = transform[:3, :3]
     proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
     if not proper or np.linalg.det(rotation) < 0 or not np.allclose(transform[3], (0, 0, 0, 1)):
-        raise InputError(f"{where}: is not a rotation and a shift, got\n{transform}")
+        hint = (
+            "; it looks transposed: its shift stands in the last row, and belongs in the last "
+            "column, above the 1"
+            if proper and transform[3, :3].any() and not transform[:3, 3].any()
+            else ""
+        )
+        raise InputError(f"{where}: is not a rotation and a shift, got\n{transform}{hint}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,27 +67,137 @@ static int tank(double level_mj, double capacity_mj)
     return 0;
 }
 
-/* Whether a force that a server might render by mistake is none; then it is made stale again. */
-static int nothing(double force[3])
+/* Whether numbers that a server might use by mistake are zeros; then they are made stale again. */
+static int nothing(double *numbers, size_t count)
 {
-    int none = force[0] == 0 && force[1] == 0 && force[2] == 0;
-    force[0] = force[1] = force[2] = 9;
+    int none = 1;
+    for (; count; numbers[--count] = 9) none &= numbers[count - 1] == 0;
     return none;
 }
 
 static int refuse(const bf_field *field)
 {
-    double point[3] = {0, 0, 0}, bad[3] = {0, NAN, 0}, force[3] = {9, 9, 9}, phases[2] = {0, 0};
-    bf_tool none = {NULL, 0, 0, {0, 0, 0}};
-    double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-    return !(bf_force(field, -1, point, 0, force) == BF_NO_SUCH_NAME && nothing(force) &&
+    double point[3] = {0, 0, 0}, bad[3] = {0, NAN, 0}, answer[12], phases[2] = {0, 0};
+    double *force = answer, *rest = answer + 3;
+    nothing(answer, 12);
+    return !(bf_force(field, -1, point, 0, force) == BF_NO_SUCH_NAME && nothing(force, 3) &&
              bf_force(field, field->fixtures, point, 0, force) == BF_NO_SUCH_NAME &&
-             bf_force(field, 0, bad, 0, force) == BF_NOT_FINITE && nothing(force) &&
-             bf_force(field, 0, point, INFINITY, force) == BF_NOT_FINITE && nothing(force) &&
-             bf_distance(field, 99, point, 0, force, NULL) == BF_NO_SUCH_NAME &&
-             bf_forces(field, 0, 1, point, phases, 2, force, NULL) == BF_WRONG_SIZE && nothing(force) &&
-             bf_tool_force(field, 0, &none, identity, 0, 0.1, force, NULL, NULL) == BF_WRONG_SIZE && nothing(force) &&
+             nothing(force, 3) &&
+             bf_force(field, 0, bad, 0, force) == BF_NOT_FINITE && nothing(force, 3) &&
+             bf_force(field, 0, point, INFINITY, force) == BF_NOT_FINITE && nothing(force, 3) &&
+             bf_distance(field, 99, point, 0, force, rest) == BF_NO_SUCH_NAME &&
+             nothing(force, 1) && nothing(rest, 3) &&
+             bf_distance(field, 0, bad, 0, force, NULL) == BF_NOT_FINITE && nothing(force, 1) &&
+             bf_potential(field, 0, bad, 0, force) == BF_NOT_FINITE && nothing(force, 1) &&
+             bf_potential(field, -1, point, 0, force) == BF_NO_SUCH_NAME && nothing(force, 1) &&
+             bf_forces(field, 0, 1, point, phases, 2, force, NULL) == BF_WRONG_SIZE &&
+             nothing(force, 3) &&
+             bf_distances(field, 0, 1, bad, phases, 1, force, rest, NULL) == BF_NOT_FINITE &&
+             nothing(force, 1) && nothing(rest, 3) &&
              bf_structure(field, "none") == -1 && bf_fixture(field, "") == -1);
+}
+
+/* Whether a tool's question has a status, and where that is a failure no force, torque or count. */
+static int felt(const bf_field *field, const bf_tool *tool, const double *pose, double phase,
+                double bound_n, bf_status wanted)
+{
+    double answer[6];
+    int evaluations = 9, none;
+    bf_status status;
+    nothing(answer, 6);
+    status = bf_tool_force(field, 0, tool, pose, phase, bound_n, answer, answer + 3, &evaluations);
+    none = nothing(answer, 6) && evaluations == 0;
+    return status == wanted && (status == BF_OK || none);
+}
+
+static int refuse_tools(const bf_field *field)
+{
+    double line[6] = {0, 0, 0, 0, 0, 9};
+    double pose[16] = {1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1};
+    double by_columns[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1};
+    double turned[16] = {0.6, -0.8, 0, 5, 0.8, 0.6, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1};
+    bf_tool needle = {NULL, 2, 0, {0, 0, 0}}, none = {NULL, 0, 0, {0, 0, 0}}, strange, far, point;
+    int fine;
+    needle.points_mm = line;
+    strange = far = point = needle;
+    strange.handle_mm[1] = NAN;
+    far.handle_mm[0] = 1.7e308;
+    far.handle_mm[1] = -1.7e308;
+    point.points_mm = line + 3;
+    point.count = 1;
+    fine = felt(field, &needle, pose, 0, 0.1, BF_OK) && felt(field, &point, pose, 0, 0.1, BF_OK) &&
+           felt(field, &none, pose, 0, 0.1, BF_WRONG_SIZE) &&
+           felt(field, &needle, pose, 0, 0, BF_WRONG_BOUND) &&
+           felt(field, &needle, pose, 0, -1, BF_WRONG_BOUND) &&
+           felt(field, &needle, pose, 0, NAN, BF_WRONG_BOUND) &&
+           felt(field, &needle, pose, INFINITY, 0.1, BF_NOT_FINITE) &&
+           felt(field, &strange, pose, 0, 0.1, BF_NOT_FINITE) &&
+           felt(field, &far, turned, 0, 0.1, BF_NOT_FINITE) &&
+           felt(field, &needle, turned, 0, 0.1, BF_OK) &&
+           felt(field, &needle, by_columns, 0, 0.1, BF_NOT_RIGID);
+    line[4] = NAN;
+    fine = fine && felt(field, &needle, pose, 0, 0.1, BF_NOT_FINITE) &&
+           felt(field, &point, pose, 0, 0.1, BF_NOT_FINITE);
+    pose[3] = NAN;
+    return !(fine && felt(field, &needle, pose, 0, 0.1, BF_NOT_FINITE));
+}
+
+/* FIELD poses: transforms -> the status of a tool there */
+static int poses(const bf_field *field)
+{
+    const double line[6] = {0, 0, 0, 0, 0, 9};
+    bf_tool needle = {NULL, 2, 0, {0, 0, 0}};
+    double q[16], force[3], answer;
+    needle.points_mm = line;
+    while (fread(q, sizeof(double), 16, stdin) == 16) {
+        answer = bf_tool_force(field, 0, &needle, q, 0, 0.1, force, NULL, NULL);
+        fwrite(&answer, sizeof(double), 1, stdout);
+    }
+    return 0;
+}
+
+/* FIELD damaged, and a question (x, y, z, phase) whose answer a damaged value spoils: whether every
+ * function says so and gives zeros, and a structure that is not damaged answers as ever. */
+static int damaged(const bf_field *field)
+{
+    enum { MANY = 2048 };
+    static double points[3 * MANY], phases[MANY], answers[4 * MANY], scratch[BF_SCRATCH * MANY];
+    const double line[6] = {-20, 0, 0, 20, 0, 0};
+    double q[4], pose[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    bf_tool needle = {NULL, 2, 0, {0, 0, 0}};
+    int n, fine = fread(q, sizeof(double), 4, stdin) == 4;
+    needle.points_mm = line;
+    for (n = 0; n < 3; n++) pose[4 * n + 3] = q[n];
+    nothing(answers, 4 * MANY);
+    for (n = 0; n < 2; n++)
+        fine = fine && field->fixture[n].structure == 0 &&
+               bf_force(field, n, q, q[3], answers) == BF_DAMAGED && nothing(answers, 3) &&
+               bf_potential(field, n, q, q[3], answers) == BF_DAMAGED && nothing(answers, 1);
+    fine = fine && bf_distance(field, 0, q, q[3], answers, answers + 1) == BF_DAMAGED &&
+           nothing(answers, 4) && bf_distance(field, 0, q, q[3], NULL, NULL) == BF_DAMAGED &&
+           felt(field, &needle, pose, q[3], 0.05, BF_DAMAGED) &&
+           bf_force(field, 2, q, q[3], answers) == BF_OK;
+    /* Far from one another, so that scratch room is used; the damage is met in the middle. */
+    for (n = 0; n < MANY; n++) {
+        points[3 * n + n % 3] = n % 2 ? 30 : -30;
+        phases[n] = n / 7.0;
+    }
+    memcpy(points + MANY / 2 * 3, q, 3 * sizeof(double));
+    phases[MANY / 2] = q[3];
+    nothing(answers, 4 * MANY);
+    scratch[0] = 7;
+    for (n = 0; n < 2; n++) {
+        double *room = n ? scratch : NULL;
+        fine = fine &&
+               bf_forces(field, 0, MANY, points, phases, MANY, answers, room) == BF_DAMAGED &&
+               nothing(answers, 3 * MANY) &&
+               bf_distances(field, 0, MANY, points, phases, MANY, answers, answers + MANY, room) ==
+                   BF_DAMAGED &&
+               nothing(answers, 4 * MANY) &&
+               bf_forces(field, 2, MANY, points, phases, MANY, answers, room) == BF_OK;
+        nothing(answers, 4 * MANY);
+    }
+    return !(fine && scratch[0] != 7);
 }
 
 int main(int count, char **words)
@@ -109,7 +219,10 @@ int main(int count, char **words)
     }
     if (count > 5) failed = feel(&field, atof(words[3]), atoi(words[4]), atoi(words[5]));
     else if (count > 4) failed = tank(atof(words[3]), atof(words[4]));
-    else if (count > 2 && strcmp(words[2], "refuse") == 0) failed = refuse(&field);
+    else if (count > 2 && strcmp(words[2], "refuse") == 0)
+        failed = refuse(&field) || refuse_tools(&field);
+    else if (count > 2 && strcmp(words[2], "poses") == 0) failed = poses(&field);
+    else if (count > 2 && strcmp(words[2], "damaged") == 0) failed = damaged(&field);
     else if (count > 2 && strcmp(words[2], "lock") == 0) failed = bf_lock(&field) == BF_CANNOT_READ;
     else if (count > 2 && strcmp(words[2], "contains") == 0) failed = contains(&field);
     else failed = ask(&field);

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import subprocess
 import sys
 
@@ -195,6 +197,63 @@ def test_a_beat_before_the_last_does_not_count():
     clock = PhaseClock(0.8)
     clock.beat(2.0)
     assert clock.beat(1.5) is None
+
+
+@pytest.mark.parametrize("wrong_s", [1012.0, 12_000.0, 1.75e9])
+def test_a_beat_of_another_clock_is_refused_and_changes_nothing(wrong_s):
+    clock, other = PhaseClock(0.8), PhaseClock(0.8)
+    for k, now_s in enumerate(np.arange(0.0, 20.0, TICK_S)):
+        if k % 200 == 50:
+            assert clock.beat(now_s - KNOWN_S) == other.beat(now_s - KNOWN_S) == "normal"
+        if k == 3000:
+            assert clock.beat(wrong_s) is None
+        assert clock.at(now_s) == other.at(now_s)
+    assert clock.at(20.0).valid
+
+
+def test_how_far_ahead_a_beat_may_lie():
+    clock = PhaseClock(0.8)
+    clock.at(10.0)
+    assert clock.beat(13.001) is None
+    assert clock.beat(12.999) == "normal"
+    # Of beats told in advance each is held against the one before it.
+    assert clock.beat(15.9) == "normal"
+    assert clock.beat(19.0) is None
+
+
+def test_beats_told_before_the_first_question_and_far_from_it_are_forgotten():
+    clock, other = PhaseClock(0.8), PhaseClock(0.8)
+    for wrong_s in (1000.0, 1000.8, 1001.6, 1002.4):
+        assert clock.beat(wrong_s) == "normal"
+    for k, now_s in enumerate(np.arange(0.0, 8.0, TICK_S)):
+        if k % 200 == 50:
+            assert clock.beat(now_s - KNOWN_S) == other.beat(now_s - KNOWN_S) == "normal"
+        assert clock.at(now_s) == other.at(now_s)
+    assert clock.at(8.0).valid
+
+
+def test_beats_may_be_told_long_before_the_first_question():
+    clock = PhaseClock(0.8)
+    r_s = 100.0 + regular()
+    assert [clock.beat(one) for one in r_s] == ["normal"] * len(r_s)
+    assert clock.at(r_s[-1] + 0.2).phase == pytest.approx(0.25, abs=1e-9)
+    assert clock.next_rr_s == pytest.approx(0.8)
+
+
+def test_questions_may_lie_far_apart():
+    """As of somebody who asks for the phases of a few pictures, all beats told in between."""
+    clock, r_s, told_s = PhaseClock(0.8), regular(200), -np.inf
+    for now_s in (30.05, 75.3, 140.6):
+        for one in r_s[(r_s > told_s) & (r_s <= now_s)]:
+            assert clock.beat(one) == "normal"
+        told_s = now_s
+        assert cyclic(clock.at(now_s).phase - (now_s - 0.2) / 0.8) == pytest.approx(0, abs=1e-6)
+
+
+def test_what_the_clock_says_can_be_written_as_json():
+    clock = PhaseClock(0.8)
+    said = json.loads(json.dumps(dataclasses.asdict(clock.at(1.0))))
+    assert said["valid"] is False
 
 
 def test_the_clock_loads_nothing_heavier_than_numpy_and_numba():

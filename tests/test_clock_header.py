@@ -41,8 +41,9 @@ def test_compiles_without_a_warning(tmp_path, compiler, standard, language):
 
 
 def stream(rng: np.random.Generator) -> np.ndarray:
-    """Beats and questions in turn: ramps, early beats, disorder, pauses, lost leads, times back."""
-    rows = []
+    """Beats and questions in turn: ramps, early beats, disorder, pauses, lost leads, times back,
+    and beats of another clock, before the first question too."""
+    rows = [(0, 500.0 + rng.uniform(), False)] if rng.random() < 0.5 else []
     r_s, now_s, rr_s = 0.3, 0.0, float(rng.uniform(0.4, 1.2))
     for _ in range(120):
         mood = rng.integers(12)
@@ -54,7 +55,11 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             now_s += float(rng.uniform(0.001, 0.05))
         if mood == 5:
             rows.append((1, now_s - 5.0, True))
+        if mood == 7:
+            rows.append((0, r_s + 1000.0, False))
         rows.append((0, r_s - (2.0 if mood == 6 else 0.0), rng.random() < 0.1))
+        if mood == 8:
+            rows.append((0, r_s + rng.uniform(2.5, 3.5), False))
         r_s += step_s
     return np.array(rows, dtype=float)
 
@@ -85,6 +90,9 @@ def test_c_says_what_python_says(program, seed):
     # may differ by units in the last place, which nothing here amplifies a millionfold.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
     assert {0, 1, 2} <= set(expected[:, 3]), "the stream meets most states"
+    other_clock = expected[rows[:, 1] > 1000, 0]
+    assert len(other_clock)
+    assert (other_clock == -1).all()
     assert len(STATES) == 4
     assert len(KINDS) == 3
 

@@ -231,11 +231,50 @@ def test_csv_change_of_rate_is_refused(tmp_path):
         read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
 
 
-def test_csv_time_running_back_is_refused(tmp_path):
+@pytest.mark.parametrize("rows", [(10, 11), (10, 700)])
+def test_csv_time_running_back_is_refused(tmp_path, rows):
     times_s = np.arange(1000) / RATE_HZ
-    times_s[[10, 11]] = times_s[[11, 10]]
-    with pytest.raises(InputError, match="does not rise"):
+    times_s[list(rows)] = times_s[list(rows)[::-1]]
+    with pytest.raises(InputError, match=r"does not rise.*sort the rows"):
         read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+def test_csv_rows_in_any_order_are_to_be_sorted(tmp_path):
+    times_s = np.random.default_rng(0).permutation(1000) / RATE_HZ
+    with pytest.raises(InputError, match="sort the rows"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+@pytest.mark.parametrize("rate_hz", [1000.0, 2000.0])
+def test_csv_times_that_jitter_are_not_called_unsorted(tmp_path, rate_hz):
+    """0.4 ms, as of a computer that stamps samples when it gets them."""
+    times_s = np.arange(1000) / rate_hz + 0.4e-3 * np.random.default_rng(0).normal(size=1000)
+    with pytest.raises(InputError, match=r"ecg\.csv: time_s scatters by up to 1\.\d+ ms") as told:
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+    assert "sort" not in str(told.value)
+    assert f"even grid of {1e3 / rate_hz:.3g} ms" in str(told.value)
+
+
+def test_csv_samples_that_were_stamped_in_blocks_are_told(tmp_path):
+    times_s = np.arange(1000) // 20 * 20 / RATE_HZ
+    with pytest.raises(InputError, match="scatters by up to"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+def test_csv_row_that_stands_twice_is_told(tmp_path):
+    times_s = np.delete(np.arange(1001), 500) / RATE_HZ
+    times_s[500] = times_s[499]
+    with pytest.raises(InputError, match=r"line 502\); take out the copy"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+@pytest.mark.parametrize(("unit", "count"), [("milliseconds", 1000), ("microseconds", 1_000_000)])
+@pytest.mark.parametrize("rate_hz", [128.0, 500.0, 2000.0])
+def test_csv_times_in_another_unit_are_told(tmp_path, unit, count, rate_hz):
+    path = write_csv(tmp_path / "ecg.csv", times_s=count * np.arange(1000) / rate_hz)
+    words = rf"ecg\.csv: time_s rises by .* is it in {unit} \({rate_hz:g} .* divide it by {count}"
+    with pytest.raises(InputError, match=words):
+        read_ecg(path)
 
 
 @pytest.mark.parametrize(

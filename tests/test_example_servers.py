@@ -127,6 +127,53 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
     np.testing.assert_allclose(by_c[:, 4:], by_python[:, 4:], rtol=0, atol=2e-3)
 
 
+GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200\n"
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+@pytest.mark.parametrize(
+    "row",
+    [
+        "abc,,",
+        "2026-01-01,normal,1",
+        "2.0,normal,1,II,0.8,0.999,2.1x",
+        "2.0,regular,1,II,0.8,0.999,2.13",
+        "nan,normal,1,II,0.8,0.999,2.13",
+        # Cut off in the last number.
+        "2.0,normal,1,II,0.8,0.999,1",
+        "",
+        "2.0,normal,1," + "I" * 300 + ",0.8,0.999,2.13",
+    ],
+)
+def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, row):
+    head = "time_s,kind,valid,lead,rr_s,likeness,known_s\n"
+    program = built(tmp_path, "gcc", "-std=c99")
+    words = [str(program), str(path), str(tmp_path / "peaks.csv"), *map(str, TIP_MM)]
+    (tmp_path / "peaks.csv").write_text(f"{head}{GOOD_ROW}{row}\n{GOOD_ROW}")
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"{tmp_path / 'peaks.csv'}, line 3: is no row" in done.stderr
+    assert done.stderr.count("\n") == 1
+    (tmp_path / "peaks.csv").write_text(head + GOOD_ROW.replace("II", '"II, left"').strip())
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    # The header, and the one millisecond at which the beat is known.
+    assert len(done.stdout.splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time_s,II\n0.000,0.1\nabc,,\n", "line 3: needs 2 numbers"),
+        ("time_s,II\n0.000,0.1\n2026-01-01,1\n", "line 3: needs 2 numbers"),
+    ],
+)
+def test_a_broken_row_of_samples_is_told_with_its_line(tmp_path, path, capsys, text, words):
+    (tmp_path / "ecg.csv").write_text(text)
+    code, out, err = python_server(capsys, path, tmp_path / "ecg.csv", *TIP_MM)
+    assert (code, out) == (2, "")
+    assert f"{tmp_path / 'ecg.csv'}, {words}" in err
+
+
 def test_wrong_words_are_told(path, tmp_path, capsys):
     assert python_server(capsys, path, "nowhere")[0] == 2
     code, out, err = python_server(capsys, path, tmp_path / "none", 900, 0, 0)

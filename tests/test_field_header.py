@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from field_baked import FIXTURES, bake_small
+from field_baked import FIXTURES, PHASES, bake_small
 from scipy.spatial.transform import Rotation
 
+from pipeline.errors import InputError
 from pipeline.field import ForceField, get_include
 from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
+from pipeline.field.tool import Needle
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "docs" / "examples" / "query.c"
@@ -128,12 +130,56 @@ def test_example_prints_what_query_says(path, tmp_path):
         said = [float(word) for word in line.split("force ")[1].split()[:3]]
         np.testing.assert_allclose(said, field.force_n([point], phase, name)[0], rtol=1e-8)
     assert run(program, path.parent / "none", *point, phase).returncode == 2
+    said = run(program, path, 500, 0, 0, phase).stdout.decode().splitlines()
+    assert all(line.endswith(" (outside the grid)") for line in said)
+    assert not any("outside" in line for line in lines)
 
 
 @pytest.mark.parametrize("word", ["refuse", "lock"])
 def test_wrong_questions_have_codes(path, watched, word):
     done = run(watched, path, word)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("way", [[], ["-DBEATFIELD_PLAIN"]], ids=["wide", "plain"])
+def test_a_field_that_is_damaged_gives_zeros_and_says_so(path, tmp_path, way):
+    """One coefficient that is no number, in a file whose size is as it should be."""
+    program = build(HERE / "field_driver.c", tmp_path / "driver", "-std=c99", *SANITIZE, *way)
+    field, folder = ForceField.open(path), tmp_path / "f.zarr"
+    shutil.copytree(path, folder)
+    chunk = np.memmap(folder / "spline/ball/c/1/0/0/0", "<f4", "r+", shape=field.grid.shape)
+    node = (9, 12, 10)
+    question = np.array([*field.grid.origin_mm + 3.0 * np.array(node[::-1]), PHASES[1]]).tobytes()
+    assert run(program, folder, "damaged", given=question).returncode == 100
+    for value in (np.nan, np.inf, -np.inf):
+        chunk[node] = value
+        done = run(program, folder, "damaged", given=question)
+        assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_a_pose_that_is_none_is_refused_as_in_python(path, watched):
+    turn = np.eye(4)
+    turn[:3] = np.column_stack([Rotation.from_rotvec((0.3, -1, 2)).as_matrix(), (5, -6, 7)])
+    stretched = [np.diag([1 + off, 1, 1, 1]) for off in (1, 6e-4, 4e-4, -4e-4, -6e-4)]
+    sheared, last = np.eye(4) + np.eye(4, k=1) * 0.9e-3, turn.copy()
+    sheared[2, 3], last[3, 3] = 0, 1 + 1e-6
+    mirror, skew = np.diag([1.0, 1, -1, 1]), np.eye(4) + 2e-3 * np.diag([1, 0, 0], k=1)
+    poses = [turn, turn.T, mirror, 0 * turn, skew, sheared, last, *stretched]
+    field, tool = ForceField.open(path), Needle(shape="needle", length_mm=9)
+
+    def refused(pose):
+        try:
+            field.tool_force(tool, pose, 0.0)
+        except InputError:
+            return True
+        return False
+
+    done = run(watched, path, "poses", given=np.array(poses).tobytes())
+
+    assert (done.returncode, done.stderr) == (0, b"")
+    found = np.frombuffer(done.stdout) != 0
+    assert found.tolist() == [refused(pose) for pose in poses]
+    assert found.tolist() == [n not in (0, 5, 9, 10) for n in range(len(poses))]
 
 
 def test_a_comma_for_a_point_in_the_locale_does_not_matter(path, program):

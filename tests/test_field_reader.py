@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
+from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.field import Fixture, ForceField, kernels
 from pipeline.field.bake import bake_field
@@ -300,6 +301,30 @@ def test_phases_beside_the_seam_are_places_in_the_cycle(field, tiny):
 def test_wrong_questions_are_refused(field, ask, words):
     with pytest.raises(InputError, match=words):
         ask(field)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_damaged_field_is_named_not_the_question(path, tmp_path, capsys, value):
+    """One coefficient of the ball is no number, in a file of the right size."""
+    folder = shutil.copytree(path, tmp_path / "f.zarr")
+    field, phase = ForceField.open(folder), PHASES[1]
+    chunk = np.memmap(folder / "spline/ball/c/1/0/0/0", "<f4", "r+", shape=field.grid.shape)
+    chunk[9, 12, 10] = value
+    point = (field.grid.origin_mm + 3.0 * np.array([10, 12, 9])).tolist()
+    for ask in (field.force_n, field.potential, field.distance_mm, field.gradient):
+        with pytest.raises(InputError, match=r"f\.zarr: is damaged.*`beatfield verify .*f\.zarr`"):
+            ask([(0, 0, 30), point], phase)
+    for one in (field.force_at, field.distance_at):
+        with pytest.raises(InputError, match=r"f\.zarr: is damaged"):
+            one(*point, phase)
+        with pytest.raises(InputError, match=r"nan.* mm at phase .* is not finite"):
+            one(np.nan, *point[1:], phase)
+    # Far from the damage, and where another surface acts, it answers as ever.
+    assert field.force_at(0, 0, 30, phase)[2] < 0
+    assert np.isfinite(field.force_at(*point, phase, "stay_out")).all()
+    where = ["--point", *map(str, point), "--phase", str(phase)]
+    assert main(["query", str(folder), *where]) == 2
+    assert "is damaged" in capsys.readouterr().err
 
 
 def test_numbers_of_any_type_are_answered_without_compiling_anew(field):

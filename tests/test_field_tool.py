@@ -1,6 +1,8 @@
 """Tools of any shape: read, divided, and felt like a plain sum over their points."""
 
 import re
+import shutil
+import subprocess
 import warnings
 from pathlib import Path
 
@@ -11,16 +13,22 @@ from field_baked import FIXTURES, bake_small
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.field import ForceField
-from pipeline.field.tool import Polyline, read_tool, spread_points
+from pipeline.field import ForceField, get_include
+from pipeline.field.tool import Needle, Polyline, read_tool, spread_points
 
-TOOLS = sorted((Path(__file__).parent.parent / "configs" / "tools").glob("*.yaml"))
+ROOT = Path(__file__).parent.parent
+TOOLS = sorted((ROOT / "configs" / "tools").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
-def field(tmp_path_factory):
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tool") / "field.zarr"
     bake_small(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def field(folder):
     return ForceField.open(folder)
 
 
@@ -142,6 +150,63 @@ def test_wrong_questions_about_tools_are_refused(field, tmp_path):
         field.tool_force(tool, np.eye(4), 0.1, bound_n=0)
     with pytest.raises(InputError, match="no fixture"):
         field.tool_force(tool, np.eye(4), 0.1, "none")
+
+
+def test_a_tool_in_a_damaged_field_is_told_so(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "f.zarr")
+    damaged = ForceField.open(tmp_path / "f.zarr")
+    for phase in range(len(damaged.phases)):
+        chunk = tmp_path / f"f.zarr/spline/ball/c/{phase}/0/0/0"
+        np.memmap(chunk, "<f4", "r+", shape=damaged.grid.shape)[9:12, 9:12, 9:12] = np.nan
+    pose = np.eye(4)
+    pose[:3, 3] = damaged.grid.origin_mm + 3.0 * np.array([10, 10, 10])
+    needle = Needle(shape="needle", length_mm=30)
+    with pytest.raises(InputError, match=r"f\.zarr: is damaged.*`beatfield verify"):
+        damaged.tool_force(needle, pose, 0.3)
+    # The other structure is whole.
+    assert np.isfinite(damaged.tool_force(needle, pose, 0.3, "stay_out").torque_nmm).all()
+
+
+def page_code(word):
+    """The one piece of C on the page of the field that has a word."""
+    page = (ROOT / "docs" / "field.md").read_text()
+    [code] = [part for part in re.findall("```c\n(.*?)```", page, re.DOTALL) if word in part]
+    return code
+
+
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_the_pages_lines_of_c_are_a_program(folder, field, tmp_path, language):
+    """Its loop, then its needle: a point's force in the grid, none beyond it, and Python's tool."""
+    if shutil.which("gcc") is None or (language == "c++" and shutil.which("g++") is None):
+        pytest.skip(f"needs a compiler of {language}")
+    head, body = page_code("bf_open").split("bf_field field;")
+    body, end = body.replace("epicardium_guidance", "guide").split("bf_close(")
+    (tmp_path / "page.c").write_text(
+        f"{head}\nint main(int count, char **words)\n{{\n"
+        "double phase = 0.37, point_mm[3] = {0, -3.5, 16.25};\n"
+        "if (count > 1) point_mm[0] = atof(words[1]);\n"
+        f"bf_field field;{body}\nfwrite(force_n, sizeof(double), 3, stdout);\n"
+        f"{page_code('bf_tool_force')}\nfwrite(force_n, sizeof(double), 3, stdout);\n"
+        f"fwrite(torque_nmm, sizeof(double), 3, stdout);\nbf_close({end}\n"
+        "return status == BF_OK ? 0 : 1;\n}\n"
+    )
+    command = ["gcc", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{get_include()}"]
+    command += ["-x", language, "page.c", "-o", "page", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    place = tmp_path / "OUT/patient-0001/bake"
+    place.mkdir(parents=True)
+    (place / "field.zarr").symlink_to(folder)
+    needle = Needle(shape="needle", length_mm=150, handle_mm=(0, 0, 150))
+    for x_mm in (4.0, 500.0):
+        done = subprocess.run(["./page", str(x_mm)], cwd=tmp_path, capture_output=True, check=True)
+        found = np.frombuffer(done.stdout)
+        tip_mm, pose = (x_mm, -3.5, 16.25), np.eye(4)
+        pose[:3, 3] = tip_mm
+        felt = field.tool_force(needle, pose, 0.37, "guide")
+        point_n = field.force_at(*tip_mm, 0.37, "guide") if x_mm < 100 else (0, 0, 0)
+        np.testing.assert_allclose(found[:3], point_n, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[3:6], felt.force_n, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[6:], felt.torque_nmm, rtol=0, atol=1e-6)
 
 
 def wrong_meshes(folder: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,10 +25,12 @@ from data_synth.population import draw_heart
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import MovingSurface
+from pipeline.job import Skipped
 from pipeline.registration import space
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
 from pipeline.registration.uncertainty import motion_between
+from pipeline.stages import register as stage
 
 # A tool that is off by this much misses: the figure that the field's users are promised.
 PROMISED_MM = 1.5
@@ -204,8 +208,45 @@ class TestRefusals:
 
     def test_start_that_looks_past_the_heart_is_refused(self, surfaces, recording):
         away = start_off(recording, 0, 400, 0)
-        with pytest.raises(InputError, match="cross the heart"):
+        with pytest.raises(InputError, match=r"cross the heart.*directions.*ImageToProbe.*units"):
             register(recording.sweeps, recording.phases, surfaces, away, QUICK)
+
+    def test_start_that_is_given_the_other_way_round_is_told(self, surfaces, recording):
+        inverse = np.linalg.inv(start_off(recording, 0, 5, 5))
+        with pytest.raises(InputError, match=r"cross the heart.*by its inverse they do"):
+            register(recording.sweeps, recording.phases, surfaces, inverse, QUICK)
+
+    def test_start_in_columns_is_told(self, surfaces, recording):
+        columns = recording.mr_from_tracker.T
+        with pytest.raises(InputError, match=r"initial mr_from_tracker(.*\n)*.*looks transposed"):
+            register(recording.sweeps, recording.phases, surfaces, columns, QUICK)
+
+    @pytest.mark.parametrize("on_failure", ["stop", "mr_frame"])
+    @pytest.mark.parametrize("wrong", [InputError("none crosses"), StageError("no pose")])
+    def test_a_stage_that_fails_says_what_its_transforms_look_like(
+        self, monkeypatch, recording, wrong, on_failure
+    ):
+        def failing(*_):
+            raise wrong
+
+        monkeypatch.setattr(stage, "register", failing)
+        monkeypatch.setattr(stage, "read_cine", lambda _: None)
+        settings = RegisterSettings(on_failure=on_failure)
+        job = SimpleNamespace(
+            settings=SimpleNamespace(register_=settings), products=Path(), progress=None
+        )
+        timing = SimpleNamespace(phases=lambda: recording.phases)
+        near = np.tile(np.eye(4), (14, 1, 1))
+        near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
+        poses = recording.sweeps[0].tracker_from_image
+        sweeps = [SimpleNamespace(tracker_from_image=poses, tracker_from_probe=near)]
+        stop = isinstance(wrong, InputError) or on_failure == "stop"
+        with pytest.raises(type(wrong) if stop else Skipped, match=f"{wrong}; .*in metres"):
+            stage._registered(job, sweeps, timing, {}, None)
+        sweeps[0].tracker_from_probe = 1000 * near
+        with pytest.raises(type(wrong) if stop else Skipped) as told:
+            stage._registered(job, sweeps, timing, {}, None)
+        assert "metres" not in str(told.value)
 
     def test_start_must_be_rigid(self, surfaces, recording):
         scaled = np.diag([1.1, 1.1, 1.1, 1.0]) @ recording.mr_from_tracker

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +14,7 @@ from data_synth.ecg import EcgSettings, simulate_ecg
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
+from pipeline.stages.register import _timing
 
 RATE_HZ = 500.0
 # How far a detected peak may lie from the R wave it stands for and still be the same event: under
@@ -205,6 +209,39 @@ def test_partial_beats_at_both_ends_take_the_median_interval():
 def test_times_that_the_ecg_does_not_cover_are_refused(time_s):
     with pytest.raises(InputError, match="does the ECG cover the images"):
         phases_at(np.array([3.5, time_s]), np.array([2.0, 3.0, 4.2, 5.2]))
+
+
+R_TIMES_S = 0.4 + 0.8 * np.arange(60)
+
+
+@pytest.mark.parametrize(
+    ("times", "r_times_s", "words"),
+    [
+        (np.linspace(447.203, 2397.693, 40), R_TIMES_S, " divided by 1000"),
+        (1.75e9 + np.arange(40.0), R_TIMES_S, " the times look as if counted from 1970"),
+        (1.75e12 + np.arange(40.0), R_TIMES_S, " the times look as if counted from 1970"),
+        (np.arange(40.0), R_TIMES_S + 1.75e9, " the R peaks look as if counted from 1970"),
+        (np.arange(40.0) + 2e9, R_TIMES_S + 1.75e9, ""),
+        (0.04 * np.arange(40) + 100, R_TIMES_S, ""),
+    ],
+)
+def test_times_of_another_clock_are_told(times, r_times_s, words):
+    sweep, ecg = Path("us/fan.mha"), Path("ecg/us")
+    files = SimpleNamespace(us=SimpleNamespace(sweeps=(sweep,)), ecg=SimpleNamespace(us=ecg))
+    sweeps = [SimpleNamespace(times_s=times)]
+    with pytest.raises(InputError) as told:
+        _timing(SimpleNamespace(study=files), sweeps, r_times_s, None)
+    said = str(told.value)
+    assert said.startswith("us/fan.mha, beside ecg/us: ")
+    assert said.partition("on the same clock?")[2].startswith(words)
+    assert bool(words) == (not said.endswith("?"))
+
+
+def test_times_that_the_ecg_covers_are_taken():
+    files = SimpleNamespace(us=SimpleNamespace(sweeps=("a", "b")), ecg=SimpleNamespace(us="ecg"))
+    sweeps = [SimpleNamespace(times_s=np.arange(5.0) + one) for one in (2.0, 20.0)]
+    timing = _timing(SimpleNamespace(study=files), sweeps, R_TIMES_S, 0.8)
+    assert [len(phases) for phases in timing.phases()] == [5, 5]
 
 
 @pytest.mark.parametrize("r_times_s", [[], [1.0], [2.0, 1.0], [1.0, 1.0, 2.0]])

@@ -7,6 +7,7 @@ import pytest
 
 from data_synth.ecg import EcgSettings, LostLead, simulate_ecg
 from pipeline.errors import InputError
+from pipeline.registration.rhythm import doubt, read_rhythm
 from pipeline.registration.rpeaks import LATENCY_S, LEARN_S, RPeakDetector, find_beats
 
 # AAMI EC57 matches a detection to a beat within 150 ms.
@@ -189,6 +190,25 @@ def test_the_future_changes_no_beat():
     ]
     assert both[0] == both[1]
     assert len(both[0]) > 8
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("leads", [1, 3])
+def test_beats_made_of_noise_are_doubted(seed, leads):
+    noise = np.random.default_rng(seed).normal(size=(7500, leads))
+    beats = read_rhythm(noise, 250.0)
+    others = sum(beat.kind != "normal" for beat in beats)
+    assert f"{others} of {len(beats)} beats are not normal, and at " in doubt(beats)
+
+
+@pytest.mark.parametrize("settings", [{}, {"muscle_snr_db": 6.0}, {"ectopic_probability": 0.1}])
+def test_beats_of_a_heart_are_not_doubted(settings):
+    ecg = record(seed=2, **settings)
+    assert doubt(read_rhythm(ecg.signal_mv, 250.0)) == ""
+
+
+def test_a_record_without_a_beat_is_doubted():
+    assert "no beat" in doubt(read_rhythm(np.zeros((2500, 2)), 250.0))
 
 
 @pytest.mark.parametrize(("rate_hz", "leads", "words"), [(99.0, 1, "99"), (2001.0, 1, "2001")])

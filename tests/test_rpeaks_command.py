@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import errno
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +54,30 @@ def test_csv_times_are_those_of_the_recording(ecg, tmp_path):
     found_s = np.array([float(row["time_s"]) for row in rows_of(tmp_path / "p.csv")])
     inner_s = 100.0 + ecg.r_times_s[(ecg.r_times_s > 0.1) & (ecg.r_times_s < 39.8)]
     assert np.abs(inner_s[:, None] - found_s).min(axis=1).max() < 0.02
+
+
+def test_a_disk_that_takes_no_files_is_told(ecg, tmp_path, capsys, monkeypatch):
+    write_wfdb(tmp_path, "rec", ecg)
+
+    def refused(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    opened = Path.open
+    monkeypatch.setattr(
+        Path, "open", lambda p, m="r", *a, **k: refused(p) if "w" in m else opened(p, m, *a, **k)
+    )
+    monkeypatch.setattr(Path, "unlink", refused)
+    assert main(["rpeaks", str(tmp_path / "rec"), "--out", str(tmp_path / "p.csv")]) == 2
+    said = capsys.readouterr().err
+    assert f"error: {tmp_path / 'p.csv'}: cannot be written (Read-only file system" in said
+    assert "may write in" in said
+
+
+def test_a_name_that_is_a_folder_is_told(ecg, tmp_path, capsys):
+    write_wfdb(tmp_path, "rec", ecg)
+    assert main(["rpeaks", str(tmp_path / "rec"), "--out", str(tmp_path)]) == 2
+    assert f"error: {tmp_path}: cannot be written" in capsys.readouterr().err
+    assert not (tmp_path.parent / f".{tmp_path.name}.part").exists()
 
 
 @pytest.mark.parametrize(

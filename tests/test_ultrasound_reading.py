@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import zlib
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.imaging.ultrasound import read_sweep
+from pipeline.imaging.ultrasound import odd_transforms, read_sweep
 
 FRAMES, ROWS, COLUMNS = 5, 12, 17
 PIXELS = np.random.default_rng(0).integers(0, 256, (FRAMES, ROWS, COLUMNS)).astype(np.uint8)
@@ -103,26 +106,95 @@ def test_missing_file_is_named(tmp_path):
         read_sweep(tmp_path / "s.mha")
 
 
+@pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.98])
-def test_truncated_file_is_refused(tmp_path, kept):
-    path = write(tmp_path / "s.mha", good_fields())
+def test_truncated_file_is_refused(tmp_path, kept, compress, capfd):
+    path = write(tmp_path / "s.mha", good_fields(), compress=compress)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(InputError, match=r"s\.mha"):
+    with pytest.raises(InputError, match=r"s\.mha: .*; copy it again") as told:
         read_sweep(path)
+    if kept > 0.9:
+        needed = int(re.search(rb"CompressedDataSize = (\d+)", content)[1]) if compress else 1020
+        found = needed - len(content) + int(kept * len(content))
+        assert f"need {needed} bytes, it holds {found} of them" in str(told.value)
+    assert capfd.readouterr() == ("", ""), "the library's own lines are for nobody"
 
 
-def test_header_without_its_raw_file_is_refused(tmp_path):
+@pytest.mark.parametrize("name", ["s.raw", "s.zraw"])
+def test_truncated_raw_file_is_named(tmp_path, name, capfd):
+    path = write(tmp_path / "s.mhd", good_fields(), compress=name == "s.zraw")
+    raw = tmp_path / name
+    raw.write_bytes(raw.read_bytes()[:-100])
+    with pytest.raises(InputError, match=rf"{name}: ends too early"):
+        read_sweep(path)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("fault", ["damaged", "short"])
+def test_compressed_pixels_that_cannot_be_unpacked_are_refused(tmp_path, fault, capfd):
+    path = write(tmp_path / "s.mhd", good_fields(), compress=True)
+    raw = tmp_path / "s.zraw"
+    packed = bytearray(raw.read_bytes())
+    if fault == "damaged":
+        packed[300:400] = bytes(100)
+    else:
+        packed[:] = zlib.compress(bytes(500)).ljust(len(packed), b"\0")
+    raw.write_bytes(packed)
+    words = {"damaged": "compressed pixels are damaged", "short": "500 of them can be unpacked"}
+    with pytest.raises(InputError, match=rf"s\.zraw: .*{words[fault]}"):
+        read_sweep(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_pixels_in_one_file_a_frame_are_left_to_the_library(tmp_path):
+    path = write(tmp_path / "s.mhd", good_fields())
+    path.write_text(path.read_text().replace("s.raw", "s%d.raw 0 4 1"))
+    for k in range(FRAMES):
+        (tmp_path / f"s{k}.raw").write_bytes(PIXELS[k].tobytes())
+    np.testing.assert_array_equal(read_sweep(path).images, PIXELS)
+
+
+def test_header_without_its_raw_file_is_refused(tmp_path, capfd):
     path = write(tmp_path / "s.mhd", good_fields())
     path.with_suffix(".raw").unlink()
-    with pytest.raises(InputError, match=r"s\.mhd"):
+    with pytest.raises(InputError, match=r"s\.mhd: its pixels are in .*s\.raw, which is no file"):
         read_sweep(path)
+    assert capfd.readouterr() == ("", "")
 
 
-def test_file_of_another_kind_is_refused(tmp_path):
+def test_file_of_another_kind_is_refused(tmp_path, capfd):
     (tmp_path / "s.mha").write_text("not an image")
-    with pytest.raises(InputError, match="MetaImage"):
+    with pytest.raises(InputError, match="no MetaImage file: it begins with 'not an image'"):
         read_sweep(tmp_path / "s.mha")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_transforms_in_metres_are_told_but_not_refused(tmp_path):
+    fields = good_fields()
+    for k in range(FRAMES):
+        pose = rigid(k)
+        pose[:3, 3] /= 1000
+        fields[f"Seq_Frame{k:04d}_ProbeToTrackerTransform"] = text(pose)
+    sweep = read_sweep(write(tmp_path / "s.mha", fields))
+    assert "ProbeToTracker looks as if it were in metres" in odd_transforms([sweep])
+    moved = read_sweep(write(tmp_path / "t.mha", good_fields()))
+    assert odd_transforms([sweep, moved]) == ""
+
+
+def test_a_probe_held_still_is_not_told(tmp_path):
+    fields = good_fields()
+    for k in range(FRAMES):
+        fields[f"Seq_Frame{k:04d}_ProbeToTrackerTransform"] = text(rigid(0))
+    assert odd_transforms([read_sweep(write(tmp_path / "s.mha", fields))]) == ""
+
+
+def test_a_probe_without_calibration_is_told(tmp_path):
+    fields = good_fields()
+    for k in range(FRAMES):
+        fields[f"Seq_Frame{k:04d}_ImageToProbeTransform"] = text(np.eye(4))
+    sweep = read_sweep(write(tmp_path / "s.mha", fields))
+    assert "ImageToProbe is the identity" in odd_transforms([sweep])
 
 
 @pytest.mark.parametrize("name", ["ProbeToTracker", "ImageToProbe"])
@@ -151,7 +223,15 @@ def test_probe_pose_that_is_not_rigid_is_refused(tmp_path, fault):
         pose[:3, 0] *= {"scaled": 1.01, "mirrored": -1.0}[fault]
     fields = good_fields()
     fields["Seq_Frame0002_ProbeToTrackerTransform"] = text(pose)
-    with pytest.raises(InputError, match=r"frame 2: ProbeToTrackerTransform: is not a rotation"):
+    words = r"frame 2: ProbeToTrackerTransform: is not a rotation"
+    with pytest.raises(InputError, match=words) as told:
+        read_sweep(write(tmp_path / "s.mha", fields))
+    assert "transposed" not in str(told.value)
+
+
+def test_probe_pose_in_columns_is_told(tmp_path):
+    fields = good_fields() | {"Seq_Frame0002_ProbeToTrackerTransform": text(rigid(2).T)}
+    with pytest.raises(InputError, match=r"frame 2: ProbeToTracker(.*\n)*.*looks transposed"):
         read_sweep(write(tmp_path / "s.mha", fields))
 
 

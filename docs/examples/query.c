@@ -38,8 +38,9 @@ int main(int count, char **words)
         if (status == BF_OK) status = bf_potential(&field, n, point_mm, phase, &potential);
         if (status == BF_OK) status = bf_force(&field, n, point_mm, phase, force_n);
         if (status == BF_OK)
-            printf("%s: distance %.9g mm, potential %.9g, force %.9g %.9g %.9g N\n", law->name,
-                   distance_mm, potential, force_n[0], force_n[1], force_n[2]);
+            printf("%s: distance %.9g mm, potential %.9g, force %.9g %.9g %.9g N%s\n", law->name,
+                   distance_mm, potential, force_n[0], force_n[1], force_n[2],
+                   bf_contains(&field, point_mm) ? "" : " (outside the grid)");
     }
     bf_close(&field);
     if (status != BF_OK) fprintf(stderr, "error: %s\n", bf_text(status));

@@ -31,20 +31,50 @@ static double number(const char *word)
     return end > word && !*end ? value : NAN;
 }
 
-/* The next row of `beatfield rpeaks`; 0 at the end of the file. */
-static int next_peak(FILE *file, peak *found)
+/* The table of peaks, row by row. */
+typedef struct {
+    FILE *file;
+    const char *path;
+    long line;  /* number of the one read last */
+    int broken; /* it was no row of the table, which has been told */
+} peak_table;
+
+/* Whether a line is a whole row, and what it says. */
+static int is_peak(char *line, peak *found)
 {
-    char line[256], kind[16];
-    if (!fgets(line, sizeof line, file)) return 0;
-    const char *last = strrchr(line, ',');
-    if (!last || sscanf(line, "%lf,%15[^,]", &found->r_s, kind) != 2) return 0;
-    found->known_s = atof(last + 1);
+    static const char *const kinds[] = {"normal", "ectopic", "irregular"};
+    char *kind = strchr(line, ','), *last = strrchr(line, ','), *at;
+    int commas = 0, known = 0, n;
+    for (at = line; *at; at++) commas += *at == ',';
+    if (commas < 6) return 0;
+    last[1 + strcspn(last + 1, "\r\n")] = 0;
+    *kind++ = 0;
+    kind[strcspn(kind, ",")] = 0;
+    for (n = 0; n < 3; n++) known = known || !strcmp(kind, kinds[n]);
+    found->r_s = number(line);
     found->strange = !strcmp(kind, "ectopic");
-    return 1;
+    found->known_s = number(last + 1);
+    return known && isfinite(found->r_s) && isfinite(found->known_s) && found->known_s >= found->r_s;
+}
+
+/* The next row of `beatfield rpeaks`; 0 at the end of the file, and where a row is broken. */
+static int next_peak(peak_table *table, peak *found)
+{
+    char line[256];
+    if (table->broken || !fgets(line, sizeof line, table->file)) return 0;
+    table->line++;
+    if (is_peak(line, found)) return 1;
+    table->broken = 1;
+    fprintf(stderr,
+            "error: %s, line %ld: is no row of `beatfield rpeaks`: it needs seven columns, the "
+            "first the R time in seconds, the second normal, ectopic or irregular, the last when "
+            "the beat was known, at its R time or later; write the table again\n",
+            table->path, table->line);
+    return 0;
 }
 
 /* A row a millisecond, from the moment at which the first peak is known to that of the last. */
-static bf_status serve(const bf_field *field, FILE *peaks, const double tip_mm[3])
+static bf_status serve(const bf_field *field, peak_table *peaks, const double tip_mm[3])
 {
     const double fade_per_s = FORCE_RATE_N_PER_S / field->fixture[0].f_max_n;
     bf_clock clock = bf_new_clock(field->rr_s > 0 ? field->rr_s : USUAL_RR_S, fade_per_s);
@@ -75,7 +105,7 @@ int main(int count, char **words)
 {
     bf_field field;
     bf_status status;
-    FILE *peaks;
+    peak_table peaks = {NULL, NULL, 1, 0};
     char header[256];
     double tip_mm[3];
     int n;
@@ -84,26 +114,28 @@ int main(int count, char **words)
         return 2;
     }
     for (n = 0; n < 3; n++) tip_mm[n] = number(words[3 + n]);
-    peaks = fopen(words[2], "r");
-    if (!peaks || !fgets(header, sizeof header, peaks) || strncmp(header, "time_s,kind,", 12)) {
+    peaks.path = words[2];
+    peaks.file = fopen(words[2], "r");
+    if (!peaks.file || !fgets(header, sizeof header, peaks.file) ||
+        strncmp(header, "time_s,kind,", 12)) {
         fprintf(stderr, "error: %s: is no table that `beatfield rpeaks` wrote\n", words[2]);
-        if (peaks) fclose(peaks);
+        if (peaks.file) fclose(peaks.file);
         return 2;
     }
     status = bf_open(&field, words[1]);
     if (status == BF_OK && !bf_contains(&field, tip_mm)) {
         fprintf(stderr, "error: %s: its grid does not hold the point; give one near the heart\n", words[1]);
         bf_close(&field);
-        fclose(peaks);
+        fclose(peaks.file);
         return 2;
     }
     if (status == BF_OK) {
         bf_lock(&field); /* pages in memory before the loop starts; where not allowed, read at least */
         printf("time_s,phase,valid,fade,x_n,y_n,z_n\n");
-        status = serve(&field, peaks, tip_mm);
+        status = serve(&field, &peaks, tip_mm);
         bf_close(&field);
     }
-    fclose(peaks);
+    fclose(peaks.file);
     if (status != BF_OK) fprintf(stderr, "error: %s: %s\n", words[1], bf_text(status));
-    return status == BF_OK ? 0 : 2;
+    return status == BF_OK && !peaks.broken ? 0 : 2;
 }

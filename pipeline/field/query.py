@@ -39,8 +39,8 @@ def query_point(
     Raises
     ------
     InputError
-        When the field cannot be read or has a fixture that its device cannot render, the fixture
-        is unknown or a number is not finite.
+        When the field cannot be read, is damaged or has a fixture that its device cannot render,
+        the fixture is unknown or a number is not finite.
     """
     field = ForceField.open(path)
     points = [point_mm]

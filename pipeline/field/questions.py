@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 
@@ -28,11 +31,27 @@ def four_floats(
         ) from None
 
 
-def not_finite(x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
-    """What to raise when a question's answer is none."""
+def no_answer(path: Path, x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
+    """What to raise when a question's answer is none: the question's fault, or the field's."""
+    # The sum, as in the kernels: numbers so large that theirs is infinite are not answered either.
+    if math.isfinite(float(x_mm) + float(y_mm) + float(z_mm) + float(phase)):
+        return damaged(path)
     return InputError(
         f"point ({x_mm}, {y_mm}, {z_mm}) mm at phase {phase} is not finite; every number must be"
     )
+
+
+def damaged(path: Path) -> InputError:
+    """What to raise when a question of finite numbers has an answer that is none."""
+    return InputError(
+        f"{path}: is damaged: a value in it is not finite; `beatfield verify {path}` tells where"
+    )
+
+
+def require_answers(answers: Float, path: Path) -> None:
+    """Raise InputError unless all answers of the field at ``path`` are finite."""
+    if not np.isfinite(answers).all():
+        raise damaged(path)
 
 
 def require_finite(points: Float, phases: Float | None = None, first: int = 0) -> None:

@@ -21,7 +21,15 @@ from pipeline.field.files import map_phase, read_metadata, readable_in_fours, re
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
-from pipeline.field.questions import as_phases, as_points, four_floats, not_finite, require_finite
+from pipeline.field.questions import (
+    as_phases,
+    as_points,
+    damaged,
+    four_floats,
+    no_answer,
+    require_answers,
+    require_finite,
+)
 from pipeline.field.spline import timeline
 from pipeline.field.threads import in_parts
 from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
@@ -186,7 +194,7 @@ class ForceField:
         Raises
         ------
         InputError
-            When a shape is wrong, a value is not finite, or a name unknown.
+            When a shape is wrong, a value is not finite, a name unknown, or the field damaged.
         """
         return self._sample(points_mm, phase, self._structure(structure))[0]
 
@@ -223,6 +231,7 @@ class ForceField:
         def ask(part: slice, moments: Float) -> None:
             require_finite(points[part], moments, part.start)
             sample_force(law, points[part], moments, force_n[part])
+            require_answers(force_n[part], self._path)
 
         in_parts(ask, phases, len(points))
         return force_n
@@ -235,7 +244,7 @@ class ForceField:
         Raises
         ------
         InputError
-            When a number is not finite, or the structure unknown.
+            When a number is not finite, the structure unknown, or the field damaged.
         """
         kernel = self._distance_at or self._load()[0]
         try:
@@ -245,8 +254,9 @@ class ForceField:
             raise self._unknown("structure", structure, self._addresses) from None
         where = four_floats(x_mm, y_mm, z_mm, phase)
         found: float = kernel(addresses, self._line, self._numbers, *where)[0]
-        if found != found:
-            raise not_finite(x_mm, y_mm, z_mm, phase)
+        # Neither of what is no number nor of what is infinite is the difference zero.
+        if found - found != 0.0:
+            raise no_answer(self._path, x_mm, y_mm, z_mm, phase)
         return found
 
     def force_at(
@@ -257,7 +267,7 @@ class ForceField:
         Raises
         ------
         InputError
-            When a number is not finite, or the fixture unknown.
+            When a number is not finite, the fixture unknown, or the field damaged.
         """
         kernel = self._force_at or self._load()[1]
         try:
@@ -266,8 +276,9 @@ class ForceField:
             raise self._unknown("fixture", fixture, self._laws) from None
         where = four_floats(x_mm, y_mm, z_mm, phase)
         force_n: tuple[float, float, float] = kernel(*law, *where)
+        # Where one of the three is no number, no one is.
         if force_n[0] != force_n[0]:
-            raise not_finite(x_mm, y_mm, z_mm, phase)
+            raise no_answer(self._path, x_mm, y_mm, z_mm, phase)
         return force_n
 
     def tool_force(
@@ -299,7 +310,8 @@ class ForceField:
         Raises
         ------
         InputError
-            When the pose is not rigid, a number not finite, or the fixture unknown.
+            When the pose is not rigid, a number not finite, the fixture unknown, or the field
+            damaged.
         """
         kernel = self._tool_force or self._load_tools()
         if not (bound_n > 0 and math.isfinite(phase)):
@@ -324,6 +336,8 @@ class ForceField:
         if asked < 0:
             require_rigid(pose, "mr_from_tool")
             raise InputError(f"mr_from_tool: is no rotation and shift to 1e-3, got\n{pose}")
+        if found[0] != found[0]:
+            raise damaged(self._path)
         return ToolForce(found[:3], found[3:], asked)
 
     _tool_force: Any = None
@@ -374,6 +388,8 @@ class ForceField:
         def ask(part: slice, moments: Float) -> None:
             require_finite(points[part], moments, part.start)
             sample(*field, points[part], moments, distance_mm[part], gradient[part])
+            # A value of the field that is none leaves none in both.
+            require_answers(distance_mm[part], self._path)
 
         in_parts(ask, phases, len(points))
         return distance_mm, gradient

@@ -18,6 +18,11 @@ from pipeline.geometry import Float
 MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
 """Millivolts in one unit, by its name in lower case."""
 
+# Samples a second of an ECG: no two units of time that are a thousandfold apart both fit.
+_RATES_HZ = (100.0, 2000.0)
+# Steps by which times of samples that were taken in order may stray from an even grid.
+_JITTER_STEPS = 5.0
+
 
 @dataclass(frozen=True, slots=True)
 class Ecg:
@@ -141,24 +146,55 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
 def _even_step_s(times_s: Float, path: Path) -> float:
     """Time between samples; each must lie within half a step of an even grid."""
     steps_s = np.diff(times_s)
-    if not (steps_s > 0).all():
-        worst = int(np.argmin(steps_s > 0))
-        raise InputError(
-            f"{path}: time_s does not rise from {times_s[worst]} to {times_s[worst + 1]} s "
-            f"(line {worst + 3}); sort the rows by time"
-        )
     number = np.arange(len(times_s)) - (len(times_s) - 1) / 2
     # Least squares: the ends alone would carry their own rounding into the rate.
     even_s = float(number @ (times_s - times_s[0]) / (number @ number))
-    off_grid_s = np.ptp(times_s - even_s * number)
+    off_s = times_s - times_s.mean() - even_s * number
+    if not (steps_s > 0).all():
+        worst = int(np.argmin(steps_s > 0))
+        _refuse_jitter(off_s, even_s, steps_s, path)
+        mend = "take out the copy" if steps_s.min() == 0 else "sort the rows by time"
+        raise InputError(
+            f"{path}: time_s does not rise from {times_s[worst]} to {times_s[worst + 1]} s "
+            f"(line {worst + 3}); {mend}"
+        )
+    _require_seconds(even_s, path)
     # Rounded times stay within half a step of the grid and no step doubles; a lost sample does it.
-    if off_grid_s > even_s or steps_s.max() > 1.75 * even_s:
+    if np.ptp(off_s) > even_s or steps_s.max() > 1.75 * even_s:
+        _refuse_jitter(off_s, even_s, steps_s, path)
         gap = int(np.argmax(steps_s))
         raise InputError(
             f"{path}: samples are not evenly spaced: {steps_s[gap]:.6g} s after {times_s[gap]} s, "
             f"where {even_s:.6g} s is the mean; fill the gap or cut the recording there"
         )
     return even_s
+
+
+def _refuse_jitter(off_s: Float, even_s: float, steps_s: Float, path: Path) -> None:
+    """Refuse times that scatter about an even grid: no row is missing or in another's place."""
+    # Of a gap, or of a few rows that changed places, nearly all steps are the usual one.
+    uneven = np.abs(steps_s - even_s) > 0.1 * even_s
+    # Times that stand still, but never run back, are of samples that were stamped in blocks.
+    near = np.abs(off_s).max() < _JITTER_STEPS * even_s or steps_s.min() == 0
+    if near and uneven.mean() > 0.5:
+        raise InputError(
+            f"{path}: time_s scatters by up to {1e3 * np.abs(off_s).max():.3g} ms about an even "
+            f"grid of {1e3 * even_s:.3g} ms, too much to tell which sample is which; no row is "
+            "missing: if the samples were taken evenly, write the time of the first plus the "
+            "number of the row over the sampling rate; if not, resample them"
+        )
+
+
+def _require_seconds(step_s: float, path: Path) -> None:
+    """Refuse times that are those of an ECG in another unit."""
+    for unit, count in (("milliseconds", 1e3), ("microseconds", 1e6)):
+        rate_hz = count / step_s
+        if _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
+            raise InputError(
+                f"{path}: time_s rises by {step_s:.6g} from row to row, which is "
+                f"{1 / step_s:.3g} samples a second; is it in {unit} ({rate_hz:.4g} samples a "
+                f"second)? it needs seconds: divide it by {count:.0f}"
+            )
 
 
 def _read_dicom(path: Path) -> Ecg:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,22 @@ from pipeline.geometry import Float, Float32, require_rigid
 _FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
 # Pixels of a medical scanner, in mm: outside this the matrix is in other units, or no calibration.
 _PIXEL_MM = (0.01, 4.0)
+
+# A sweep goes over centimetres, and no tracker sees a probe at its own place: what stays within
+# these is in metres.
+_STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
+# Bytes of one value, by its name in a MetaImage header; others are the library's to check.
+_VALUE_BYTES = {
+    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4,
+    "MET_FLOAT": 4, "MET_DOUBLE": 8,
+}  # fmt: skip
+_HEADER_LINE = re.compile(r"\s*(\w+)\s*[=:](.*)")
+_HEADER_ENDS = "ElementDataFile"
+_SEVERAL_FILES = re.compile(r"%|^LIST\b|\s\d+\s+\d+")
+# A file of another kind may have no lines at all.
+_LONGEST_LINE = 65536
+_PART_BYTES = 1 << 20
+_COPY = "copy it again from the tracking computer"
 
 Fields = dict[str, str]
 
@@ -34,6 +53,9 @@ class Sweep:
 
     tracker_from_image: Float
     """``(n, 4, 4)`` from pixel ``(i = column, j = row, 0)`` to tracker mm."""
+
+    tracker_from_probe: Float
+    """``(n, 4, 4)`` what of it the tracker saw: the pose of the marker on the probe."""
 
     dropped: int = 0
     """Frames of the file left out because the tracker marked them as not valid."""
@@ -64,9 +86,41 @@ def read_sweep(path: Path) -> Sweep:
         )
     times_s = np.array([_time_s(frames[k], f"{path}, frame {k}") for k in valid])
     _require_rising(path, times_s, valid)
-    poses = [_tracker_from_image(frames[k], f"{path}, frame {k}") for k in valid]
-    kept = np.asarray(images[valid], dtype=np.float32)
-    return Sweep(path.stem, kept, times_s, np.stack(poses), len(frames) - len(valid))
+    links = [_links(frames[k], f"{path}, frame {k}") for k in valid]
+    tracker_from_probe, probe_from_image = (np.stack(link) for link in zip(*links, strict=True))
+    return Sweep(
+        path.stem,
+        np.asarray(images[valid], dtype=np.float32),
+        times_s,
+        tracker_from_probe @ probe_from_image,
+        tracker_from_probe,
+        len(frames) - len(valid),
+    )
+
+
+def odd_transforms(sweeps: Sequence[Sweep]) -> str:
+    """What the transforms of sweeps that do not fit their heart look like; empty if like nothing.
+
+    Each may be right by itself, so nothing is refused for it.
+    """
+    probe_mm = np.concatenate([sweep.tracker_from_probe[:, :3, 3] for sweep in sweeps])
+    spread_mm = float(np.linalg.norm(np.ptp(probe_mm, axis=0)))
+    furthest_mm = float(np.linalg.norm(probe_mm, axis=1).max())
+    found = []
+    if spread_mm < _STILL_MM and furthest_mm < _TOO_NEAR_MM:
+        found.append(
+            f"ProbeToTracker looks as if it were in metres: over all sweeps the probe moves by "
+            f"{spread_mm:.3g} mm, at {furthest_mm:.3g} mm from the tracker or nearer; give mm"
+        )
+    if all(_is_uncalibrated(sweep) for sweep in sweeps):
+        found.append(
+            "ImageToProbe is the identity, pixels for millimetres: give the probe's calibration"
+        )
+    return "; ".join(found)
+
+
+def _is_uncalibrated(sweep: Sweep) -> bool:
+    return np.allclose(sweep.tracker_from_image, sweep.tracker_from_probe, rtol=0, atol=1e-9)
 
 
 def _read_image(path: Path) -> tuple[Any, Fields]:
@@ -75,6 +129,7 @@ def _read_image(path: Path) -> tuple[Any, Fields]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; a sweep is a .mha, or a .mhd with its raw file")
+    _require_all_bytes(path)
     reader = sitk.ImageFileReader()
     reader.SetImageIO("MetaImageIO")
     reader.SetFileName(str(path))
@@ -82,12 +137,90 @@ def _read_image(path: Path) -> tuple[Any, Fields]:
         image = reader.Execute()
     except RuntimeError as error:
         raise InputError(
-            f"{path}: cannot be read as a MetaImage sequence, or ends too early ({_gist(error)}); "
-            "copy it again from the tracking computer"
+            f"{path}: cannot be read as a MetaImage sequence ({_gist(error)}); {_COPY}"
         ) from error
     _require_grey_frames(path, image)
     fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
     return sitk.GetArrayFromImage(image), fields
+
+
+def _require_all_bytes(path: Path) -> None:
+    """Refuse a file whose pixels are missing, end before they should, or cannot be unpacked.
+
+    The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
+    """
+    header, start = _header_of(path)
+    where = header.get(_HEADER_ENDS, "")
+    if _SEVERAL_FILES.search(where):
+        return
+    pixels = path if where.upper() == "LOCAL" else path.parent / where
+    if not pixels.is_file():
+        raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
+    packed = header.get("CompressedData", "False").upper() == "TRUE"
+    needed = _number(header.get("CompressedDataSize")) if packed else _pixel_bytes(header)
+    found = pixels.stat().st_size - (start if pixels == path else 0)
+    if needed is not None and found < needed:
+        raise InputError(
+            f"{pixels}: ends too early: its pixels need {needed} bytes, it holds {found} of them; "
+            f"{_COPY}"
+        )
+    if packed:
+        _require_unpacked(pixels, start if pixels == path else 0, _pixel_bytes(header))
+
+
+def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
+    """Refuse compressed pixels that are damaged."""
+    # Of zlib or gzip, whichever it says.
+    unpacking, found = zlib.decompressobj(32 + zlib.MAX_WBITS), 0
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            while not unpacking.eof and (part := file.read(_PART_BYTES)):
+                found += len(unpacking.decompress(part))
+    except zlib.error as error:
+        raise InputError(f"{path}: its compressed pixels are damaged ({error}); {_COPY}") from error
+    if needed is not None and found < needed:
+        raise InputError(
+            f"{path}: its pixels need {needed} bytes, {found} of them can be unpacked; {_COPY}"
+        )
+
+
+def _header_of(path: Path) -> tuple[Fields, int]:
+    """The fields of a header and the place where it ends."""
+    header: Fields = {}
+    with path.open("rb") as file:
+        while _HEADER_ENDS not in header:
+            line = file.readline(_LONGEST_LINE)
+            if not line:
+                raise InputError(
+                    f"{path}: is no whole MetaImage file: its header does not end with a line "
+                    f"{_HEADER_ENDS} within its {file.tell()} bytes; {_COPY}"
+                )
+            text = line.decode("utf-8", errors="replace")
+            field = _HEADER_LINE.match(text)
+            if field:
+                header[field[1]] = field[2].strip()
+            elif not header:
+                raise InputError(
+                    f"{path}: is no MetaImage file: it begins with {text[:20].strip()!r}, not "
+                    "with a line KEY = VALUE; name a .mha, or a .mhd with its raw file"
+                )
+        return header, file.tell()
+
+
+def _pixel_bytes(header: Fields) -> int | None:
+    """How many bytes all pixels take; None where the header does not say."""
+    sizes = [_number(word) for word in header.get("DimSize", "?").split()]
+    sizes += [
+        _number(header.get("ElementNumberOfChannels", "1")),
+        _VALUE_BYTES.get(header.get("ElementType", "")),
+    ]
+    known = [size for size in sizes if size is not None]
+    return math.prod(known) if len(known) == len(sizes) else None
+
+
+def _number(word: str | None) -> int | None:
+    return int(word) if word and word.isdecimal() else None
 
 
 def _gist(error: RuntimeError) -> str:
@@ -157,13 +290,13 @@ def _require_rising(path: Path, times_s: Float, numbers: list[int]) -> None:
         )
 
 
-def _tracker_from_image(fields: Fields, where: str) -> Float:
-    """Pixel to tracker of one frame, each link of the chain checked."""
+def _links(fields: Fields, where: str) -> tuple[Float, Float]:
+    """Probe to tracker, and pixel to probe, of one frame, each checked."""
     tracker_from_probe = _matrix(fields, "ProbeToTrackerTransform", where)
     require_rigid(tracker_from_probe, f"{where}: ProbeToTrackerTransform")
     probe_from_image = _matrix(fields, "ImageToProbeTransform", where)
     _require_calibration(probe_from_image, f"{where}: ImageToProbeTransform")
-    return np.asarray(tracker_from_probe @ probe_from_image)
+    return tracker_from_probe, probe_from_image
 
 
 def _matrix(fields: Fields, name: str, where: str) -> Float:

@@ -93,7 +93,9 @@ class PhaseClock:
     def beat(self, r_time_s: float, strange: bool = False) -> Kind | None:
         """Tell the clock of an R peak; what kind of beat it is.
 
-        None when it lies before one that was told already, which does not count.
+        None when it does not count, and nothing changes: it lies no later than one that was told
+        already, or more than 3 s after the latest time that the clock was told of, by :meth:`at` or
+        by a beat. So far ahead it was timed by another clock, or in another unit.
 
         Parameters
         ----------
@@ -107,6 +109,9 @@ class PhaseClock:
 
     def at(self, now_s: float, usable: bool = True) -> Tick:
         """Phase now.
+
+        Beats that lie more than 3 s after it were told too early to be judged: they are forgotten,
+        and the rhythm is learnt anew.
 
         Parameters
         ----------
@@ -127,7 +132,7 @@ class PhaseClock:
             float(c[ticks.PHASE]),
             float(c[ticks.SD]),
             STATES[int(c[ticks.STATE])],
-            c[ticks.VALID] > 0,
+            bool(c[ticks.VALID] > 0),
             float(c[ticks.FADE]),
         )
 

@@ -10,12 +10,14 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
+from pipeline.publish import readable_write_errors
 from pipeline.registration.clock import Kind, PhaseClock
 from pipeline.registration.rpeaks import Beat, RPeakDetector, with_end_held
 
 NOMINAL_RR_S = 0.8
 # How often the clock is asked: often enough to see a lead come off for less than a beat.
 _STEP_S = 0.02
+_COLUMNS = ("time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,21 @@ def _row(beat: Beat, kind: Kind, valid: bool, rr_s: float) -> RhythmBeat:
     return RhythmBeat(beat.time_s, kind, valid, beat.lead, rr_s, beat.likeness, beat.known_s)
 
 
+def doubt(beats: Sequence[RhythmBeat]) -> str:
+    """What speaks against the beats of a whole recording, for its user; empty for sound ones."""
+    if not beats:
+        return "no beat was found; does the record show a heart, with its leads connected?"
+    other = sum(beat.kind != "normal" for beat in beats)
+    valid = sum(beat.valid for beat in beats)
+    if 2 * other <= len(beats) <= 2 * valid:
+        return ""
+    return (
+        f"{other} of {len(beats)} beats are not normal, and at {valid} the phase could be relied "
+        "on: this is noise, a heart without order, or a few seconds only; look at the record "
+        "before its beats are used"
+    )
+
+
 def write_rhythm(
     path: Path, beats: Sequence[RhythmBeat], leads: Sequence[str], start_s: float = 0.0
 ) -> None:
@@ -104,14 +121,18 @@ def write_rhythm(
     """
     part = path.with_name(f".{path.name}.part")
     try:
-        with part.open("w", newline="", encoding="utf-8") as file:
-            table = csv.writer(file, lineterminator="\n")
-            table.writerow(["time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s"])
-            for one in beats:
-                table.writerow(_cells(one, leads, start_s))
-        part.replace(path)
+        with readable_write_errors(path):
+            try:
+                with part.open("w", newline="", encoding="utf-8") as file:
+                    table = csv.writer(file, lineterminator="\n")
+                    table.writerow(_COLUMNS)
+                    for one in beats:
+                        table.writerow(_cells(one, leads, start_s))
+                part.replace(path)
+            finally:
+                # Where nothing may be written, this is refused as well.
+                part.unlink(missing_ok=True)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists"
         ) from error

@@ -45,6 +45,11 @@ _STEPS = 5
 _LACKING = 0.2
 # Points of the heart at which the expected error is looked at, of each surface.
 _POINTS = 200
+_INVERTED = "by its inverse they do: is initial_mr_from_tracker given the other way round?"
+_MISPLACED = (
+    "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
+    "ProbeToTracker, ImageToProbe), at the calibration in ImageToProbe, and at units: mm throughout"
+)
 
 Progress = Callable[[int, int], None]
 
@@ -243,13 +248,20 @@ def _require_heart_in_view(level: Level, search: Search) -> None:
     """Refuse frames that miss the heart wherever the tracker may stand."""
     if search.start is None:
         return
-    seen = max((level.at(pose).in_view > _LEAST_IN_VIEW).sum() for pose in search.candidates(level))
-    if seen < min(search.settings.min_frames, level.samples.frames) or seen == 0:
+    settings, frames = search.settings, level.samples.frames
+    needed, seen = max(1, min(settings.min_frames, frames)), _most_in_view(level, search)
+    if seen < needed:
+        inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
         raise InputError(
-            f"of {level.samples.frames} frames looked at, {seen} or fewer cross the heart at every "
-            f"pose within {search.settings.capture_mm:g} mm and {search.settings.capture_deg:g} "
-            "degrees of the start; is initial_mr_from_tracker right, in the direction of its name?"
+            f"of {frames} frames looked at, {seen} or fewer cross the heart at every pose within "
+            f"{settings.capture_mm:g} mm and {settings.capture_deg:g} degrees of the start; "
+            + (_INVERTED if _most_in_view(level, inverse) >= needed else _MISPLACED)
         )
+
+
+def _most_in_view(level: Level, search: Search) -> int:
+    poses = search.candidates(level)
+    return max(int((level.at(pose).in_view > _LEAST_IN_VIEW).sum()) for pose in poses)
 
 
 def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> float:

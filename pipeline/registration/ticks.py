@@ -32,6 +32,10 @@ IRREGULAR, ORDERLY = 0.075, 0.05
 """Step from interval to interval, as a share, which two thirds of the steps exceed where the rhythm
 has no order; and below which it has one again."""
 
+AHEAD_S = 3.0
+"""How far a beat may lie beyond the latest time that the clock was told of: no heart waits longer,
+so what lies further ahead was timed by another clock, or in another unit."""
+
 LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
 NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
 # Places of the state.
@@ -91,8 +95,17 @@ def reset(c: Float, cycle_rr_s: float, fade_per_s: float) -> None:
         c[i] = 0.0
     c[CYCLE_RR] = cycle_rr_s
     c[FADE_PER_S] = fade_per_s
-    c[RR] = cycle_rr_s
-    c[SPREAD] = 0.05 * cycle_rr_s
+    _forget(c)
+
+
+@compiled
+def _forget(c: Float) -> None:
+    """Know of no beat, as at the start; the time and what is rendered stay."""
+    for i in range(RINGS, SIZE):
+        c[i] = 0.0
+    c[LAST_R], c[BEATS], c[COUNT] = 0.0, 0.0, 0.0
+    c[RR] = c[CYCLE_RR]
+    c[SPREAD] = 0.05 * c[CYCLE_RR]
     c[NEEDED] = 3.0
 
 
@@ -120,8 +133,12 @@ def _was_regular(c: Float, back: int) -> bool:
 
 @compiled
 def beat(c: Float, r_s: float, strange: bool) -> int:
-    """An R peak became known; what kind of beat it is, or -1 if it is no later than the last."""
+    """An R peak became known; what kind of beat it is, or -1 if it does not count: it is no later
+    than the last, or too far ahead of all that the clock was told."""
     if not math.isfinite(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
+        return -1
+    # The last beat counts beside the time: beats may be told in advance, in their order.
+    if (c[STARTED] > 0.0 or c[BEATS] > 0.0) and r_s > _latest(c) + AHEAD_S:
         return -1
     rr_s = r_s - c[LAST_R]
     c[LAST_R] = r_s
@@ -143,6 +160,14 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     if c[STATE] == FIBRILLATING:
         return IRREGULAR_BEAT
     return ECTOPIC_BEAT if early else NORMAL_BEAT
+
+
+@compiled
+def _latest(c: Float) -> float:
+    """The latest time that the clock was told of, by a question or by a beat."""
+    if c[STARTED] > 0.0 and c[BEATS] > 0.0:
+        return float(max(c[NOW], c[LAST_R]))
+    return float(c[NOW] if c[STARTED] > 0.0 else c[LAST_R])
 
 
 @compiled
@@ -270,6 +295,10 @@ def advance(c: Float, now_s: float, usable: bool) -> int:
     passed_s = now_s - c[NOW] if c[STARTED] > 0.0 else 0.0
     before_s = now_s - passed_s
     c[STARTED], c[NOW] = 1.0, now_s
+    if c[BEATS] > 0.0 and c[LAST_R] > now_s + AHEAD_S:
+        # Told before the first question, so there was nothing to hold it against. Left in, it
+        # would make every true beat one that comes too late.
+        _forget(c)
     _watch(c, now_s, usable)
     _turn(c, before_s, now_s)
     reach = c[FADE_PER_S] * passed_s

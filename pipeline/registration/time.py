@@ -17,6 +17,10 @@ from pipeline.registration.clock import to_cycle
 from pipeline.registration.rpeaks import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, find_beats
 
 _SHORTEST_RECORD_S = 3.0
+# Three years, which no recording lasts: such times are counted from 1970.
+_SINCE_1970_S = 1e8
+# Pictures of a heart come faster than this; many a time divided by 1000 lies within the ECG.
+_SLOWEST_FRAME_S = 1.0
 # Beats of one heart resemble their usual beat; what is cut out of noise at its own maxima does so
 # with 0.3 to 0.5 in the median.
 _LEAST_LIKENESS = 0.7
@@ -110,6 +114,7 @@ def phases_at(times_s: Float, r_times_s: Float, cycle_rr_s: float | None = None)
             f"{outside.sum()} of {times.size} times, from {times.min():.3f} to {times.max():.3f} "
             f"s, lie more than one beat outside the R peaks, which go from {r_times_s[0]:.3f} to "
             f"{r_times_s[-1]:.3f} s; does the ECG cover the images, on the same clock?"
+            f"{_other_clock(times, float(starts[0]), float(ends[-1]))}"
         )
     beat = np.searchsorted(starts, times, side="right") - 1
     own_s = ends[beat] - starts[beat]
@@ -117,6 +122,21 @@ def phases_at(times_s: Float, r_times_s: Float, cycle_rr_s: float | None = None)
     # Rounding may lift a time just before an R peak to exactly 1.
     share = np.asarray(np.where(phase < 1, phase, 0.0))
     return share if cycle_rr_s is None else to_cycle(share, own_s, cycle_rr_s)
+
+
+def _other_clock(times_s: Float, start_s: float, end_s: float) -> str:
+    """What times that the ECG does not cover look like, if anything."""
+    first, last = float(times_s.min()), float(times_s.max())
+    slow = last - first > _SLOWEST_FRAME_S * (times_s.size - 1)
+    if slow and start_s <= first / 1000 and last / 1000 < end_s:
+        return " divided by 1000 the times lie within: they look like milliseconds; give seconds"
+    if (first > _SINCE_1970_S) != (start_s > _SINCE_1970_S):
+        whose = "the times" if first > start_s else "the R peaks"
+        return (
+            f" {whose} look as if counted from 1970, by a computer's clock, the others do not; "
+            "give both by one clock, in seconds"
+        )
+    return ""
 
 
 def summarise_rr(r_times_s: Float) -> RrSummary:

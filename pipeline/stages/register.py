@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import InputError, StageError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import read_ecg
-from pipeline.imaging.ultrasound import Sweep, read_sweep
+from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweep
 from pipeline.job import Job, Skipped
 from pipeline.products import (
     FrameRow,
@@ -21,7 +21,7 @@ from pipeline.products import (
 )
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.space import Registration, register
-from pipeline.registration.time import detect_r_peaks, summarise_rr
+from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def run(job: Job) -> dict[str, Any]:
     r_times_s = _r_times_s(job)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
-    timing = Timing([sweep.times_s for sweep in sweeps], r_times_s, cycle.get("rr_s"))
+    timing = _timing(job, sweeps, r_times_s, cycle.get("rr_s"))
     found = _registered(job, sweeps, timing, surfaces, start)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found))
@@ -73,10 +73,23 @@ def _registered(
     cine = read_cine(job.products / "ingest")
     try:
         return register(sweeps, phases, surfaces, start, settings, job.progress, timing, cine)
-    except StageError as error:
-        if settings.on_failure == "stop":
-            raise
-        raise Skipped(f"{error}; the field is in the frame of the MR") from error
+    except (InputError, StageError) as error:
+        odd = odd_transforms(sweeps)
+        said = type(error)(f"{error}; {odd}") if odd else error
+        if isinstance(error, InputError) or settings.on_failure == "stop":
+            raise said from error.__cause__
+        raise Skipped(f"{said}; the field is in the frame of the MR") from error
+
+
+def _timing(job: Job, sweeps: list[Sweep], r_times_s: Float, cycle_rr_s: float | None) -> Timing:
+    """When frames were taken; each sweep must lie within its ECG."""
+    assert job.study.us is not None, "only a study with ultrasound is registered"
+    for path, sweep in zip(job.study.us.sweeps, sweeps, strict=True):
+        try:
+            phases_at(sweep.times_s, r_times_s, cycle_rr_s)
+        except InputError as error:
+            raise InputError(f"{path}, beside {job.study.ecg.us}: {error}") from error
+    return Timing([sweep.times_s for sweep in sweeps], r_times_s, cycle_rr_s)
 
 
 def _r_times_s(job: Job) -> Float:

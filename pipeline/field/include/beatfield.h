@@ -19,7 +19,8 @@
  * Points are (x, y, z) millimetres in the patient's LPS frame of the MR, phases are shares of the
  * heartbeat since the R peak (any number; its fraction counts), transforms are row-major 4x4 on
  * column points. Distances are negative inside. A query allocates nothing and calls no system
- * function, so it is safe in a real-time loop and from several threads at once.
+ * function, so it is safe in a real-time loop and from several threads at once. Where it fails, its
+ * answers are zeros.
  *
  * The distance between nodes and phases is the quadratic B-spline whose coefficients the store
  * holds under spline/: neither its gradient nor its rate has a step anywhere. Potential and force
@@ -48,11 +49,13 @@ typedef enum {
     BF_CANNOT_READ,  /* a file is missing, or may not be read */
     BF_NOT_A_FIELD,  /* no manifest, or a description that is not that of a field */
     BF_WRONG_SIZE,   /* a file's size is not what the description says */
-    BF_DAMAGED,      /* a file's SHA-256 is not what the manifest says */
+    BF_DAMAGED,      /* a file is not what the manifest says, or a value in it is not finite */
     BF_NO_MEMORY,    /* malloc or mmap refused */
     BF_CANNOT_LOCK,  /* mlock refused (ulimit -l); pages are in memory, but may be paged out */
     BF_NO_SUCH_NAME, /* number of a structure or fixture that is not there */
-    BF_NOT_FINITE    /* a coordinate or phase is infinite or not a number */
+    BF_NOT_FINITE,   /* a coordinate or phase is infinite or not a number */
+    BF_NOT_RIGID,    /* mr_from_tool is no rotation and shift */
+    BF_WRONG_BOUND   /* bound_n is not above 0 */
 } bf_status;
 
 typedef struct {
@@ -125,11 +128,12 @@ bf_status bf_distances(const bf_field *field, int structure, size_t count, const
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential);
 
-/* Force of a fixture on a tool's point, newtons. Whatever gives forces gives zeros where it fails. */
+/* Force of a fixture on a tool's point, newtons. */
 bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
                    double force_n[3]);
 
-/* Forces at many points, (count, 3) numbers each; otherwise as bf_distances. */
+/* Forces at many points, (count, 3) numbers each; otherwise as bf_distances. Where one cannot be
+ * answered, all are zeros. */
 bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
                     const double *phases, size_t phase_count, double *forces_n, double *scratch);
 
@@ -145,7 +149,8 @@ typedef struct {
 /* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL):
  * the mean of the field's force over the tool's length, so no tool feels more than f_max. Pieces
  * are halved where the field demands it, until the error of the force is below bound_n; evaluations
- * (may be NULL) says how often the field was asked. */
+ * (may be NULL) says how often the field was asked. mr_from_tool is a rotation and a shift, within
+ * 1e-3, row after row; the last row is 0 0 0 1. */
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
@@ -212,11 +217,14 @@ const char *bf_text(bf_status status)
     case BF_CANNOT_READ: return "a file is missing or cannot be read";
     case BF_NOT_A_FIELD: return "no complete field: give the field.zarr that bake wrote, or bake it again";
     case BF_WRONG_SIZE: return "a size is wrong: a file's (bake it again), or a batch's or tool's (mend the call)";
-    case BF_DAMAGED: return "a file is not what the manifest says: bake it again";
+    case BF_DAMAGED:
+        return "a file is not what the manifest says, or a value is not finite: bake it again";
     case BF_NO_MEMORY: return "no memory";
     case BF_CANNOT_LOCK: return "pages cannot be locked: raise the limit (ulimit -l)";
     case BF_NO_SUCH_NAME: return "no such structure or fixture";
     case BF_NOT_FINITE: return "a coordinate or phase is not finite";
+    case BF_NOT_RIGID: return "mr_from_tool is no rotation and shift within 1e-3, row after row";
+    case BF_WRONG_BOUND: return "bound_n must be above 0";
     }
     return "unknown status";
 }
@@ -1235,27 +1243,49 @@ static int bf__finite(const double point_mm[3], double phase)
     return sum - sum == 0;
 }
 
+/* Whether an answer holds only numbers: a value of the field that is none leaves none in the
+ * distance of any answer that it has a part in, whatever its weight. */
+BF__INLINE int bf__sound(double distance_mm) { return distance_mm - distance_mm == 0; }
+
+/* Whether a fixture can be asked about a point. */
+BF__INLINE bf_status bf__answerable(const bf_field *field, int fixture, const double point_mm[3],
+                                    double phase)
+{
+    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
+    return bf__finite(point_mm, phase) ? BF_OK : BF_NOT_FINITE;
+}
+
 bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
                       double *distance_mm, double gradient[3])
 {
-    double slope[3], distance;
-    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
-    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
-    distance = bf__at(field, structure, point_mm, phase, slope);
+    double slope[3] = {0, 0, 0}, distance = 0;
+    bf_status status = structure < 0 || structure >= field->structures ? BF_NO_SUCH_NAME
+                       : bf__finite(point_mm, phase)                   ? BF_OK
+                                                                       : BF_NOT_FINITE;
+    if (status == BF_OK) {
+        distance = bf__at(field, structure, point_mm, phase, slope);
+        if (!bf__sound(distance)) {
+            distance = slope[0] = slope[1] = slope[2] = 0;
+            status = BF_DAMAGED;
+        }
+    }
     if (distance_mm) *distance_mm = distance;
     if (gradient) memcpy(gradient, slope, sizeof slope);
-    return BF_OK;
+    return status;
 }
 
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential)
 {
-    double slope[3];
+    double slope[3], distance;
     const bf_fixture_part *law;
-    if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
-    if (!bf__finite(point_mm, phase)) return BF_NOT_FINITE;
+    bf_status status = bf__answerable(field, fixture, point_mm, phase);
+    *potential = 0;
+    if (status != BF_OK) return status;
     law = &field->fixture[fixture];
-    *potential = bf__height(law, bf__at(field, law->structure, point_mm, phase, slope));
+    distance = bf__at(field, law->structure, point_mm, phase, slope);
+    if (!bf__sound(distance)) return BF_DAMAGED;
+    *potential = bf__height(law, distance);
     return BF_OK;
 }
 
@@ -1264,17 +1294,18 @@ bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3],
 {
     double slope[3], distance;
     const bf_fixture_part *law;
-    bf_status status = fixture < 0 || fixture >= field->fixtures ? BF_NO_SUCH_NAME
-                       : bf__finite(point_mm, phase)             ? BF_OK
-                                                                 : BF_NOT_FINITE;
-    if (status != BF_OK) {
-        memset(force_n, 0, 3 * sizeof(double));
-        return status;
+    bf_status status = bf__answerable(field, fixture, point_mm, phase);
+    if (status == BF_OK) {
+        law = &field->fixture[fixture];
+        distance = bf__at(field, law->structure, point_mm, phase, slope);
+        if (bf__sound(distance)) {
+            bf__push(law, distance, slope, force_n);
+            return BF_OK;
+        }
+        status = BF_DAMAGED;
     }
-    law = &field->fixture[fixture];
-    distance = bf__at(field, law->structure, point_mm, phase, slope);
-    bf__push(law, distance, slope, force_n);
-    return BF_OK;
+    memset(force_n, 0, 3 * sizeof(double));
+    return status;
 }
 
 /* ---- batches ---- */
@@ -1309,16 +1340,19 @@ enum {
     BF__AHEAD = 16         /* how many steps ahead a question is located */
 };
 
-/* Answer the question in a note (x, y, z, phase) in its place: distance and gradient, or force. */
-static void bf__answer(const bf__batch *batch, double note[4])
+/* Answer the question in a note (x, y, z, phase) in its place: distance and gradient, or force.
+ * Whether the answer is sound. */
+static int bf__answer(const bf__batch *batch, double note[4])
 {
     double slope[3], distance = bf__at(batch->field, batch->structure, note, note[3], slope);
+    int sound = bf__sound(distance);
     if (batch->law) {
         bf__push(batch->law, distance, slope, note);
     } else {
         note[0] = distance;
         memcpy(note + 1, slope, sizeof slope);
     }
+    return sound;
 }
 
 static double bf__when(const bf__batch *batch, size_t n) { return batch->phases[batch->many_phases ? n : 0]; }
@@ -1379,8 +1413,8 @@ static void bf__fetch(const void *address)
 }
 
 /* Answer the notes of one bin, and bring meanwhile into the cache the coefficients that the next one
- * will ask for: those of one more phase in the same slab. */
-static void bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_t count)
+ * will ask for: those of one more phase in the same slab. Whether all answers are sound. */
+static int bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_t count)
 {
     const bf_field *field = batch->field;
     int next = bin + 1 < batch->slabs * field->phases ? bin + 1 : bin;
@@ -1390,6 +1424,7 @@ static void bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_
     size_t high = ((size_t)slab + 1) * (size_t)field->shape[2] / (size_t)batch->slabs + 2;
     const char *start = (const char *)field->structure[batch->structure].coefficients[phase];
     size_t from, each;
+    int sound = 1;
     if (high > (size_t)field->shape[2]) high = (size_t)field->shape[2];
     from = (low ? low - 1 : 0) * layer;
     each = count ? (high * layer - from) / BF__LINE / count + 1 : 0;
@@ -1398,17 +1433,18 @@ static void bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_
         /* Where few ask, most of what would be brought is not asked for. */
         if (each <= BF__MANY_LINES)
             for (line = 0; line < each && from < high * layer; line++, from += BF__LINE) bf__fetch(start + from);
-        bf__answer(batch, notes + 4 * n);
+        sound &= bf__answer(batch, notes + 4 * n);
     }
+    return sound;
 }
 
 /* Random questions, those about neighbouring coefficients after one another: a counting sort moves
  * them into the notes and their answers back. Meanwhile the numbers of their bins lie where the
- * answers will. */
-static void bf__answer_sorted(bf__batch *batch, double *notes)
+ * answers will. Whether all answers are sound. */
+static int bf__answer_sorted(bf__batch *batch, double *notes)
 {
     unsigned end[BF__BINS + 1];
-    int most = BF__BINS / batch->field->phases, stride = batch->law ? 3 : 1, bin, bins;
+    int most = BF__BINS / batch->field->phases, stride = batch->law ? 3 : 1, bin, bins, sound = 1;
     size_t wanted = 1 + 3 * batch->field->bytes / BF__CACHE, n;
     batch->slabs = wanted < (size_t)most ? (int)wanted : most;
     if (batch->slabs > batch->field->shape[2]) batch->slabs = batch->field->shape[2];
@@ -1425,12 +1461,13 @@ static void bf__answer_sorted(bf__batch *batch, double *notes)
         bf__note(batch, n, notes + 4 * (size_t)end[(int)batch->first[stride * n]]++);
     for (bin = 0; bin < bins; bin++) {
         size_t start = bin ? end[bin - 1] : 0;
-        bf__answer_bin(batch, bin, notes + 4 * start, end[bin] - start);
+        sound &= bf__answer_bin(batch, bin, notes + 4 * start, end[bin] - start);
     }
     for (bin = bins; bin > 0; bin--) end[bin] = end[bin - 1];
     end[0] = 0;
     for (n = 0; n < batch->count; n++)
         bf__write(batch, n, notes + 4 * (size_t)end[(int)batch->first[stride * n]]++);
+    return sound;
 }
 
 /* Bring the coefficients of a place into the cache. Inlined, for GCC leaves out calls of functions that
@@ -1457,11 +1494,12 @@ static void bf__place_of(const bf__batch *batch, size_t n, bf__place *at)
 }
 
 /* Questions in their order. Each is located some steps ahead of its answer, and where it asks for other
- * coefficients than the one before, these are fetched meanwhile. */
-static void bf__answer_path(const bf__batch *batch)
+ * coefficients than the one before, these are fetched meanwhile. Whether all answers are sound. */
+static int bf__answer_path(const bf__batch *batch)
 {
     bf__place ring[BF__AHEAD];
     size_t n, ahead = 0;
+    int sound = 1;
     for (n = 0; n < batch->count; n++) {
         double slope[3], *to = batch->law ? slope : batch->rest + 3 * n, distance;
         for (; ahead < batch->count && ahead < n + BF__AHEAD; ahead++) {
@@ -1470,17 +1508,27 @@ static void bf__answer_path(const bf__batch *batch)
             if (ahead == 0 || !bf__same(at, ring + (ahead - 1) % BF__AHEAD)) bf__expect(batch->field, at);
         }
         distance = bf__sum_at(batch->field, ring + n % BF__AHEAD, to);
+        sound &= bf__sound(distance);
         if (batch->law) bf__push(batch->law, distance, slope, batch->first + 3 * n);
         else batch->first[n] = distance;
     }
+    return sound;
 }
 
 static bf_status bf__answer_all(bf__batch *batch, double *scratch)
 {
+    int sound;
     if (scratch && batch->count > 0xffffffffu) return BF_WRONG_SIZE;
-    if (scratch && batch->count >= BF__FEW && !bf__follow(batch)) bf__answer_sorted(batch, scratch);
-    else bf__answer_path(batch);
-    return BF_OK;
+    if (scratch && batch->count >= BF__FEW && !bf__follow(batch))
+        sound = bf__answer_sorted(batch, scratch);
+    else sound = bf__answer_path(batch);
+    return sound ? BF_OK : BF_DAMAGED;
+}
+
+/* Numbers that are no answers made zeros. */
+static void bf__clear(double *numbers, size_t count)
+{
+    if (count) memset(numbers, 0, count * sizeof(double));
 }
 
 bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
@@ -1488,46 +1536,51 @@ bf_status bf_distances(const bf_field *field, int structure, size_t count, const
                        double *gradients, double *scratch)
 {
     bf__batch batch;
-    bf_status status;
-    if (structure < 0 || structure >= field->structures) return BF_NO_SUCH_NAME;
-    status = bf__askable(count, points_mm, phases, phase_count);
-    if (status != BF_OK) return status;
-    batch.field = field;
-    batch.law = NULL;
-    batch.structure = structure;
-    batch.count = count;
-    batch.points_mm = points_mm;
-    batch.phases = phases;
-    batch.many_phases = phase_count > 1;
-    batch.first = distances_mm;
-    batch.rest = gradients;
-    batch.slabs = 1;
-    return bf__answer_all(&batch, scratch);
+    bf_status status = structure < 0 || structure >= field->structures
+                           ? BF_NO_SUCH_NAME
+                           : bf__askable(count, points_mm, phases, phase_count);
+    if (status == BF_OK) {
+        batch.field = field;
+        batch.law = NULL;
+        batch.structure = structure;
+        batch.count = count;
+        batch.points_mm = points_mm;
+        batch.phases = phases;
+        batch.many_phases = phase_count > 1;
+        batch.first = distances_mm;
+        batch.rest = gradients;
+        batch.slabs = 1;
+        status = bf__answer_all(&batch, scratch);
+    }
+    if (status != BF_OK) {
+        bf__clear(distances_mm, count);
+        bf__clear(gradients, 3 * count);
+    }
+    return status;
 }
 
 bf_status bf_forces(const bf_field *field, int fixture, size_t count, const double *points_mm,
                     const double *phases, size_t phase_count, double *forces_n, double *scratch)
 {
     bf__batch batch;
-    bf_status status;
-    status = fixture < 0 || fixture >= field->fixtures
-                 ? BF_NO_SUCH_NAME
-                 : bf__askable(count, points_mm, phases, phase_count);
-    if (status != BF_OK) {
-        if (count) memset(forces_n, 0, 3 * count * sizeof(double));
-        return status;
+    bf_status status = fixture < 0 || fixture >= field->fixtures
+                           ? BF_NO_SUCH_NAME
+                           : bf__askable(count, points_mm, phases, phase_count);
+    if (status == BF_OK) {
+        batch.field = field;
+        batch.law = &field->fixture[fixture];
+        batch.structure = batch.law->structure;
+        batch.count = count;
+        batch.points_mm = points_mm;
+        batch.phases = phases;
+        batch.many_phases = phase_count > 1;
+        batch.first = forces_n;
+        batch.rest = NULL;
+        batch.slabs = 1;
+        status = bf__answer_all(&batch, scratch);
     }
-    batch.field = field;
-    batch.law = &field->fixture[fixture];
-    batch.structure = batch.law->structure;
-    batch.count = count;
-    batch.points_mm = points_mm;
-    batch.phases = phases;
-    batch.many_phases = phase_count > 1;
-    batch.first = forces_n;
-    batch.rest = NULL;
-    batch.slabs = 1;
-    return bf__answer_all(&batch, scratch);
+    if (status != BF_OK) bf__clear(forces_n, 3 * count);
+    return status;
 }
 
 int bf_contains(const bf_field *field, const double point_mm[3])
@@ -1557,7 +1610,7 @@ typedef struct {
     const bf_tool *tool;
     const double *mr_from_tool;
     double phase, bound_n, longest_mm, force_n[3], torque_nmm[3];
-    int pieces, piece, evaluations;
+    int pieces, piece, evaluations, sound;
     double piece_start_mm, piece_length_mm; /* of the piece that was asked for last */
 } bf__walk;
 
@@ -1605,6 +1658,7 @@ static void bf__ask(bf__walk *walk, double along_mm, bf__feel *feel)
     bf__point(walk, along_mm, feel->point_mm);
     bf_transform(walk->mr_from_tool, feel->point_mm, moved);
     feel->distance_mm = bf__at(walk->field, law->structure, moved, walk->phase, gradient);
+    walk->sound &= bf__sound(feel->distance_mm);
     bf__push(law, feel->distance_mm, gradient, feel->force_n);
     walk->evaluations++;
 }
@@ -1632,6 +1686,8 @@ static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, doub
     bf__feel left, right;
     double way = 0.5 * length_mm, reach, off = 0;
     int axis;
+    /* Without a number no bound is ever kept, and a tick would be over long before the halving. */
+    if (!walk->sound) return;
     reach = walk->law->side == 0 ? fabs(middle->distance_mm) : walk->law->side * middle->distance_mm;
     if (2 * walk->law->f_max_n * bf__height(walk->law, walk->law->side < 0 ? -(reach + way) : reach + way) <=
         walk->bound_n) {
@@ -1656,21 +1712,39 @@ static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, doub
     bf__stretch(walk, middle_mm + way / 2, way, share / 2, &right, depth + 1);
 }
 
+/* Whether a 4x4 whose upper rows are finite is a rotation and a shift, within 1e-3. */
+static int bf__rigid(const double t[16])
+{
+    double det;
+    int a, b;
+    if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-8)) return 0;
+    for (a = 0; a < 12; a += 4)
+        for (b = 0; b < 12; b += 4) {
+            double dot = t[a] * t[b] + t[a + 1] * t[b + 1] + t[a + 2] * t[b + 2];
+            if (!(fabs(dot - (a == b)) <= 1e-3)) return 0;
+        }
+    det = t[0] * (t[5] * t[10] - t[6] * t[9]) + t[1] * (t[6] * t[8] - t[4] * t[10]) +
+          t[2] * (t[4] * t[9] - t[5] * t[8]);
+    return det > 0;
+}
+
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations)
 {
     bf__walk walk;
     bf__feel feel;
-    double total = 0, length;
+    double total = 0, length, sum;
     int n, stretches;
     memset(force_n, 0, 3 * sizeof(double));
     if (torque_nmm) memset(torque_nmm, 0, 3 * sizeof(double));
+    if (evaluations) *evaluations = 0;
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
     if (tool->count < 1) return BF_WRONG_SIZE;
-    if (!(bound_n > 0) || phase - phase != 0) return BF_NOT_FINITE;
-    for (n = 0; n < 12; n++)
-        if (mr_from_tool[n] - mr_from_tool[n] != 0) return BF_NOT_FINITE;
+    if (!(bound_n > 0)) return BF_WRONG_BOUND;
+    for (n = 0, sum = phase; n < 12; n++) sum += mr_from_tool[n];
+    if (sum - sum != 0) return BF_NOT_FINITE;
+    if (!bf__rigid(mr_from_tool)) return BF_NOT_RIGID;
     memset(&walk, 0, sizeof walk);
     walk.field = field;
     walk.law = &field->fixture[fixture];
@@ -1678,6 +1752,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     walk.mr_from_tool = mr_from_tool;
     walk.phase = phase;
     walk.bound_n = bound_n;
+    walk.sound = 1;
     walk.pieces = tool->closed ? tool->count : tool->count - 1;
     for (n = 0; n < walk.pieces; n++) total += bf__length(tool, n);
     if (total - total != 0) return BF_NOT_FINITE;
@@ -1689,12 +1764,16 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (walk.pieces) walk.piece_length_mm = bf__length(tool, 0);
     length = 4 * walk.longest_mm;
     stretches = total > length ? (int)ceil(total / length < 1e6 ? total / length : 1e6) : 1;
-    for (n = 0; n < stretches; n++) {
+    for (n = 0; n < stretches && walk.sound; n++) {
         double middle = (n + 0.5) * total / stretches;
         bf__ask(&walk, middle, &feel);
         if (total > 0) bf__stretch(&walk, middle, total / stretches, 1.0 / stretches, &feel, 0);
         else bf__add(&walk, &feel, 1);
     }
+    if (!walk.sound) return BF_DAMAGED;
+    /* What no length has told: a handle or an only point that is not finite, or too far away. */
+    for (n = 0, sum = 0; n < 3; n++) sum += walk.force_n[n] + walk.torque_nmm[n];
+    if (sum - sum != 0) return BF_NOT_FINITE;
     memcpy(force_n, walk.force_n, sizeof walk.force_n);
     if (torque_nmm) memcpy(torque_nmm, walk.torque_nmm, sizeof walk.torque_nmm);
     if (evaluations) *evaluations = walk.evaluations;

@@ -15,9 +15,10 @@
  *     bf_force(&field, 0, point_mm, now.phase, force_n);
  *     for (int i = 0; i < 3; i++) force_n[i] *= now.fade;
  *
- * Times are seconds on one clock that never runs back. Phases are those of one nominal beat, of the
- * length the field was baked for: systole keeps its length when the rate changes (Weissler, Harris
- * and Schoenfeld, Circulation 37:149-159, 1968), atria contract 120 ms before R, diastole gives way.
+ * Times are seconds on one clock that never runs back; a beat more than 3 s ahead of it is refused.
+ * Phases are those of one nominal beat, of the length the field was baked for: systole keeps its
+ * length when the rate changes (Weissler, Harris and Schoenfeld, Circulation 37:149-159, 1968), atria
+ * contract 120 ms before R, diastole gives way.
  * The phase does not jump where it is valid: it is corrected by running at half to one and a half
  * times its speed. What pipeline.registration.clock says in Python, this says with the same numbers.
  * One clock belongs to one thread.
@@ -36,7 +37,7 @@ extern "C" {
 typedef enum { BF_LOST, BF_REGULAR, BF_ECTOPIC, BF_FIBRILLATING } bf_rhythm;
 
 typedef enum {
-    BF_NO_BEAT = -1, /* no later than the last one: it does not count */
+    BF_NO_BEAT = -1, /* no later than the last one, or too far ahead: it does not count */
     BF_NORMAL_BEAT,
     BF_ECTOPIC_BEAT,
     BF_IRREGULAR_BEAT
@@ -72,10 +73,13 @@ typedef struct {
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
 
 /* An R peak became known, as a rule within 0.14 s: the clock waits no longer for one that is due.
- * strange: its shape is unlike the others'. */
+ * strange: its shape is unlike the others'. BF_NO_BEAT, and nothing changes, when it is no later than
+ * the last, or more than 3 s after the latest time told by bf_now or by a beat: so far ahead it was
+ * timed by another clock, or in another unit. */
 bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
 
-/* Phase now; usable: some lead is connected. Returns 0, or -1 when the time is no number or lies
+/* Phase now; usable: some lead is connected. Beats told before, but more than 3 s after it, are
+ * forgotten, and the rhythm is learnt anew. Returns 0, or -1 when the time is no number or lies
  * before the last one: then nothing changes and the tick repeats the last. */
 int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
 
@@ -109,6 +113,7 @@ extern "C" {
 #define BFC_QUICKEST 1.5
 #define BFC_IRREGULAR 0.075
 #define BFC_ORDERLY 0.05
+#define BFC_AHEAD_S 3.0
 
 static double bfc_min(double a, double b) { return b < a ? b : a; }
 static double bfc_max(double a, double b) { return b > a ? b : a; }
@@ -140,6 +145,18 @@ double bf_to_cycle(double phase, double rr_s, double cycle_rr_s)
 
 static double bfc_wrapped(double turns) { return turns - floor(turns + 0.5); }
 
+/* Know of no beat, as at the start; the time and what is rendered stay. */
+static void bfc_forget(bf_clock *c)
+{
+    memset(c->interval_s, 0, sizeof c->interval_s);
+    memset(c->regular, 0, sizeof c->regular);
+    c->last_r_s = c->beats = 0.0;
+    c->count = 0;
+    c->rr_s = c->cycle_rr_s;
+    c->spread_s = 0.05 * c->cycle_rr_s;
+    c->needed = 3;
+}
+
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
 {
     bf_clock clock;
@@ -147,9 +164,7 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
     clock.rhythm = BF_LOST;
     clock.cycle_rr_s = cycle_rr_s;
     clock.fade_per_s = fade_per_s;
-    clock.rr_s = cycle_rr_s;
-    clock.spread_s = 0.05 * cycle_rr_s;
-    clock.needed = 3;
+    bfc_forget(&clock);
     return clock;
 }
 
@@ -280,11 +295,22 @@ static void bfc_judge(bf_clock *c, int regular, double off_s)
     bfc_predict(c);
 }
 
+/* The latest time that the clock was told of, by a question or by a beat. */
+static double bfc_latest(const bf_clock *c)
+{
+    if (c->started && c->beats > 0.0)
+        return bfc_max(c->now_s, c->last_r_s);
+    return c->started ? c->now_s : c->last_r_s;
+}
+
 bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
 {
     double rr_s, off_s;
     int known, regular, early, place;
     if (!isfinite(r_s) || (c->beats > 0.0 && !(r_s > c->last_r_s)))
+        return BF_NO_BEAT;
+    /* The last beat counts beside the time: beats may be told in advance, in their order. */
+    if ((c->started || c->beats > 0.0) && r_s > bfc_latest(c) + BFC_AHEAD_S)
         return BF_NO_BEAT;
     rr_s = r_s - c->last_r_s;
     c->last_r_s = r_s;
@@ -367,6 +393,10 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
         double reach = c->fade_per_s * passed_s;
         c->started = 1;
         c->now_s = now_s;
+        /* Told before the first question, so there was nothing to hold it against. Left in, it
+         * would make every true beat one that comes too late. */
+        if (c->beats > 0.0 && c->last_r_s > now_s + BFC_AHEAD_S)
+            bfc_forget(c);
         bfc_watch(c, now_s, usable);
         bfc_turn(c, now_s - passed_s, now_s);
         c->fade += bfc_min(bfc_max((double)c->valid - c->fade, -reach), reach);
