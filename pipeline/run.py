@@ -32,6 +32,7 @@ from pipeline.publish import (
     write_json,
 )
 from pipeline.study import Study
+from pipeline.summary import remarks
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +150,9 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         run.stages[stage.name] = {"status": "failed", "cause": str(error)}
         run.watcher.ended(stage.name, "failed", time.perf_counter() - clock)
         _record(run, "failed")
+        # What finished stages noticed may be why this one failed.
+        for word, text in remarks(run.stages):
+            error.add_note(f"{word}: {text}")
         later = STAGES[STAGES.index(stage) :]
         if old := [one.name for one in later if (run.products / one.name).is_dir()]:
             error.add_note(

@@ -176,6 +176,24 @@ def test_a_failure_tells_of_products_that_an_earlier_run_left(kitchen: Kitchen) 
     assert note.startswith(f"b, c in {kitchen.out / 'p1'} came of an earlier run")
 
 
+def test_a_failure_repeats_what_finished_stages_noticed(
+    kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slices out of order may be why a later stage fails."""
+
+    def noticed(stages: dict[str, Any]) -> list[tuple[str, str]]:
+        return [("input", f"{name} is odd") for name in stages if name == "a"]
+
+    def fail(job: Job) -> dict[str, Any]:
+        raise StageError("not exact enough")
+
+    monkeypatch.setattr(runner, "remarks", noticed)
+    kitchen.bodies["b"] = fail
+    with pytest.raises(StageError) as caught:
+        kitchen.run()
+    assert caught.value.__notes__ == ["input: a is odd"]
+
+
 def test_a_failing_stage_publishes_nothing_and_keeps_what_was_finished(kitchen: Kitchen) -> None:
     def fail(job: Job) -> dict[str, Any]:
         (job.folder / "text").write_text("half")
