@@ -38,9 +38,7 @@ LIBRARIES = (
 )
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-REFUSED = {
-    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT
-}  # fmt: skip
+REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST}
 
 PACKAGE = Path(__file__).parent
 
@@ -78,7 +76,9 @@ def readable_write_errors(target: Path) -> Iterator[None]:
                 f"{target}: the disk is full ({error.strerror}); free some space or choose "
                 "another --out, then run again: finished stages are kept"
             ) from error
-        if error.errno in REFUSED:
+        # Some file systems, such as /proc, say so of folders that they will not make.
+        no_folder = error.errno == errno.ENOENT and Path(error.filename or "/") in target.parents
+        if error.errno in REFUSED or no_folder:
             raise InputError(
                 f"{target}: cannot be written ({error.strerror}: {error.filename}); "
                 "choose a folder that you may write in"

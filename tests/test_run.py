@@ -24,7 +24,7 @@ from pipeline import run as runner
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
-from pipeline.publish import PARTIAL, code_digest, only_run_in, publishing
+from pipeline.publish import PARTIAL, code_digest, only_run_in, publishing, readable_write_errors
 from pipeline.study import Study, open_study
 
 Body = Callable[[Job], dict[str, Any]]
@@ -243,6 +243,19 @@ def test_a_skipped_stage_says_why_and_removes_what_it_once_made(kitchen: Kitchen
     assert kitchen.record()["stages"]["b"] == {"status": "skipped", "cause": "no ultrasound"}
     assert kitchen.record()["stages"]["c"]["figures"] == {"without b": True}
     assert not (kitchen.out / "p1" / "b").exists()
+
+
+def test_a_folder_that_a_system_will_not_make_is_named_and_a_lost_input_is_not_taken_for_one(
+    tmp_path: Path,
+) -> None:
+    def missing(path: Path) -> None:
+        with readable_write_errors(tmp_path / "out" / "p1"):
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(path))
+
+    with pytest.raises(InputError, match=r"p1: cannot be written \(No such file"):
+        missing(tmp_path / "out")
+    with pytest.raises(FileNotFoundError):
+        missing(tmp_path / "study" / "sweep.mha")
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
