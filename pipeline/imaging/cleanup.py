@@ -11,6 +11,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.imaging.view import PIXEL_MM
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
+RIGHT, AORTA = LABELS["rv_cavity"], LABELS["aorta"]
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
@@ -28,6 +29,9 @@ NECK_BRUSH = np.zeros((3, 5, 5), bool)
 NECK_BRUSH[1] = np.hypot(*np.mgrid[-2:3, -2:3]) < 2.5
 NECK_BRUSH[[0, 2], 1:4, 1:4] = True
 """What is painted about the way: two pixels in its plane, one in the planes beside it."""
+
+WAIST_MM = 1.5
+"""Two discs are told apart where each is wider than the waist between them by twice this."""
 
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
@@ -123,6 +127,7 @@ def clean_probability(
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
     _join_auricle(part)
+    _part_outflow(part, pixel_mm)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
     whole = (labels > 0) | enclosed
@@ -199,6 +204,32 @@ def _join_auricle(part: Float32) -> None:
             neck[tuple(way.T)] = True
             neck = ndimage.binary_dilation(neck, NECK_BRUSH) & passable
             part[:, value][neck] = 1.0
+
+
+def _part_outflow(part: Float32, pixel_mm: float) -> None:
+    """Take from the aorta what goes on towards the apex as right ventricle, in place.
+
+    Beside the aorta's root the right ventricle's outflow looks like a second vessel. It is told by
+    the two discs that stand side by side in a plane, one of them on the ventricle's own label.
+    """
+    from skimage.morphology import h_maxima
+    from skimage.segmentation import watershed
+
+    labels = part.argmax(axis=1)
+    right = labels == RIGHT
+    outflow, root = np.zeros((2, *labels.shape), bool)
+    for number, plane in enumerate(labels == AORTA):
+        if not plane.any():
+            continue
+        depth = cv2.distanceTransform(plane.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
+        discs = watershed(-depth, middles, mask=plane)
+        beneath = right[number - 1] | outflow[number - 1] if number else np.zeros_like(plane)
+        for disc in range(1, count + 1):
+            one = discs == disc
+            (outflow if beneath[one].mean() > 0.5 else root)[number] |= one
+    if (outflow.any(axis=(1, 2)) & root.any(axis=(1, 2))).any():
+        part[:, AORTA] *= ~outflow
 
 
 def _keep_bodies(part: Float32) -> None:
