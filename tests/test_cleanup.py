@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.imaging.cleanup import clean_cycle, clean_probability, ventricle_tip
+from pipeline.imaging.cleanup import clean_cycle, clean_probability, clear_apex, ventricle_tip
 
 SIDE, PIXEL_MM = 64, 1.5
 CAVITY, MUSCLE, RV, ATRIUM, AORTA = 1, 2, 3, 4, 6
@@ -131,6 +131,18 @@ def test_an_aorta_alone_stays_whatever_lies_beneath_it():
     alone = np.where(OUTFLOW, AORTA, 0)
     heart = base_of_heart(alone, alone)
     np.testing.assert_array_equal(cleaned(heart)[3:] == AORTA, heart[3:] == AORTA)
+
+
+def test_no_atrium_lies_beside_the_tip():
+    heart = np.stack([np.zeros_like(ring()), *(ring(2 + 3 * k, 8 + 3 * k) for k in range(5))])
+    round_thing = np.hypot(X - 8, Y - 8) < 7
+    low, high = heart.copy(), heart.copy()
+    low[:2, round_thing] = ATRIUM
+    high[3:, round_thing] = ATRIUM
+    value = one_hot(np.stack([low, high]))
+    clear_apex(value)
+    np.testing.assert_array_equal(value.argmax(axis=2), np.stack([heart, high]))
+    np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-6)
 
 
 def test_the_tip_is_the_same_in_every_phase():

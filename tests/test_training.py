@@ -1,6 +1,6 @@
 """Training of the segmentation network: what it learns from, and that it can be repeated."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -33,9 +33,8 @@ from data_synth.training.render import (  # noqa: E402
     Parts,
     _draw_positions,
     draw_sample,
-    laid_bare,
-    thin_walled,
 )
+from data_synth.training.walls import laid_bare, thin_walled  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -276,6 +275,17 @@ def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
     before = torch.load(tmp_path / "heart.pt", weights_only=True)
     after = train(list(blocks), still, tmp_path / "on").state_dict()
     assert torch.equal(before["head.weight"], after["head.weight"])
+
+
+def test_training_ends_half_way_where_asked(blocks, tmp_path):
+    train(list(blocks), TrainSettings(steps=1, batch=2), tmp_path)
+    begun = torch.load(tmp_path / "heart.pt", weights_only=True)
+    far = TrainSettings(steps=2, batch=2, start=tmp_path / "heart.pt")
+    reached = train(list(blocks), far, tmp_path / "far").state_dict()
+    found = train(list(blocks), replace(far, halfway=True), tmp_path / "half").state_dict()
+    name = "head.weight"
+    assert (reached[name] - begun[name]).abs().max() > 1e-5
+    torch.testing.assert_close(found[name], (begun[name] + reached[name]) / 2, rtol=0, atol=1e-8)
 
 
 def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):

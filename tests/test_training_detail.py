@@ -8,7 +8,8 @@ from data_synth.training.contrast import IS_BLOOD, USUAL_CONTRAST
 from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
 from data_synth.training.faults import windowed
-from data_synth.training.render import _other_sizes, thick_walled, whole_septum
+from data_synth.training.render import _other_sizes
+from data_synth.training.walls import last_ring, long_walled, thick_walled, whole_septum
 
 SIDE = 64
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE]
@@ -85,6 +86,38 @@ def test_thick_walls_grow_outwards_alone_and_unevenly():
     assert max(grown) >= 4
     above, below = changed[:, :32, 32].sum(axis=1), changed[:, 33:, 32].sum(axis=1)
     assert (above != below).mean() > 0.3
+
+
+def base_planes():
+    """Three closed rings, then the left atrium with the aorta beside it, and the right atrium."""
+    plane = short_axis(Tissue.FAT)
+    above = np.full((SIDE, SIDE), Tissue.FAT, np.uint8)
+    above[np.hypot(ROWS - 32, COLUMNS - 12) < 12] = Tissue.RIGHT_ATRIUM
+    above[AWAY < 16] = Tissue.LEFT_ATRIUM
+    above[np.hypot(ROWS - 12, COLUMNS - 32) < 9] = Tissue.AORTA
+    return np.stack([plane] * 3 + [above] * 4)
+
+
+def test_last_ring_is_the_last_plane_with_muscle_all_around_the_cavity():
+    planes = base_planes()
+    assert last_ring(planes) == 2
+    planes[2][(COLUMNS > 40) & (planes[2] == Tissue.LV_MYOCARDIUM)] = Tissue.FAT
+    assert last_ring(planes) == 1
+    assert last_ring(planes[3:]) is None
+
+
+def test_a_long_walled_ventricle_goes_on_as_it_was_beside_what_lies_there():
+    planes = base_planes()
+    longer = long_walled(planes, 2, 2)
+    np.testing.assert_array_equal(longer[[0, 1, 2, 5, 6]], planes[[0, 1, 2, 5, 6]])
+    ventricle = np.isin(planes[2], (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM))
+    for plane in longer[3:5]:
+        np.testing.assert_array_equal(plane[ventricle], planes[2][ventricle])
+        assert not (plane == Tissue.LEFT_ATRIUM).any()
+        # Most of the aorta stands free of the ring, and all of the right atrium's rest.
+        for tissue in (Tissue.AORTA, Tissue.RIGHT_ATRIUM):
+            kept = (planes[3] == tissue) & ~ventricle
+            np.testing.assert_array_equal(plane == tissue, kept)
 
 
 def test_septum_has_no_wall_of_the_right_ventricle():

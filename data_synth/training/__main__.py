@@ -34,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         batch=options.batch,
         learning_rate=options.learning_rate,
         start=options.start,
+        halfway=options.halfway,
         parts=Parts(**dict.fromkeys(options.without, False)),
         seed=options.seed,
         export_minutes=options.export_minutes,
@@ -64,6 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--batch", type=int, default=8, help="images in a batch")
     parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
     parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
+    parser.add_argument(
+        "--halfway", action="store_true",
+        help="end half-way between the weights of --start and those learned since",
+    )  # fmt: skip
     parser.add_argument(
         "--without", action="append", default=[], choices=[part.name for part in fields(Parts)],
         help="leave a part of the randomisation out, to see what it is worth",

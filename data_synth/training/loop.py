@@ -6,7 +6,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,11 @@ class TrainSettings:
 
     start: Path | None = None
     """Checkpoint to go on from; by default weights are drawn at random."""
+
+    halfway: bool = False
+    """End half-way between the weights of ``start`` and those learned since: what is new is learned
+    and what was known kept (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+    """
 
     parts: Parts = ALL_PARTS
     """What is drawn at random in the images."""
@@ -113,8 +118,18 @@ def train(
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
             save(out, average.network)
+    if settings.halfway and settings.start is not None:
+        move_halfway(average.network, torch.load(settings.start, weights_only=True))
     save(out, average.network)
     return average.network
+
+
+def move_halfway(network: HeartNet, others: Mapping[str, Any]) -> None:
+    """Replace weights and running statistics by their mean with ``others``."""
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if value.dtype.is_floating_point:
+                value.add_(others[name]).div_(2)
 
 
 def save(out: Path, network: HeartNet) -> None:

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from data_synth.tissue import Tissue
 from data_synth.training.contrast import (
-    IN_HEART,
     LABEL_OF,
     USUAL_CONTRAST,
     Contrast,
@@ -23,6 +22,14 @@ from data_synth.training.contrast import (
 from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
+from data_synth.training.walls import (
+    laid_bare,
+    last_ring,
+    long_walled,
+    thick_walled,
+    thin_walled,
+    whole_septum,
+)
 
 Float = npt.NDArray[np.floating]
 Float32 = npt.NDArray[np.float32]
@@ -72,10 +79,12 @@ class Parts:
     and aorta of any size each, jets of blood, septa without trabeculae, and a window of frequencies
     that rings at edges."""
 
+    base: bool = True
+    """Left ventricles whose walls keep their thickness up to the valves, where they stand beside
+    the right atrium; and walls thicker still."""
+
 
 ALL_PARTS = Parts()
-
-_WITHIN_MUSCLE = (Tissue.LV_CAVITY, Tissue.PAPILLARY_MUSCLE)
 
 _SIZES = {
     Tissue.RV_CAVITY: 0.1,
@@ -84,14 +93,6 @@ _SIZES = {
     Tissue.AORTA: 0.22,
 }
 """How widely the sizes of structures are drawn, apart from the left ventricle's cavity."""
-
-_COVERS = np.isin(list(Tissue), (Tissue.FAT, Tissue.PERICARDIUM))
-
-_AROUND = np.isin(
-    list(Tissue),
-    (Tissue.LUNG, Tissue.LIVER, Tissue.STOMACH, Tissue.SPLEEN, Tissue.GAS, Tissue.MUSCLE),
-)
-"""What may lie against a heart, for every tissue."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,16 +108,7 @@ class Sample:
 
 def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS) -> Sample:
     """Draw one image and its labels from a ``(plane, row, column)`` tissue block."""
-    middle, end = _draw_plane(rng, block)
-    if parts.rims and rng.random() < 0.25:
-        middle, end = _draw_grazing_plane(rng, block), 0
-    planes = block[middle - REACH : middle + REACH + 1]
-    if parts.fine:
-        planes = whole_septum(planes)
-    if parts.rims and rng.random() < 0.4:
-        planes = thin_walled(planes, int(rng.integers(1, 4)))
-    if parts.fine and rng.random() < 0.45:
-        planes = thick_walled(rng, planes)
+    planes, end = _draw_planes(rng, block, parts)
     bare = parts.bare and rng.random() < 0.55
     if bare:
         planes = laid_bare(rng, planes, skin=not parts.fine)
@@ -145,6 +137,27 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
         image = windowed(rng, image)
     spoiled = spoil(rng, image) if parts.faults else spoil_little(rng, image)
     return Sample(spoiled, np.stack(carried))
+
+
+def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[Label, int]:
+    """Planes about the one to learn, their walls drawn anew, and whether it may end its stack."""
+    middle, end = _draw_plane(rng, block)
+    if parts.rims and rng.random() < 0.25:
+        middle, end = _draw_grazing_plane(rng, block), 0
+    ring = last_ring(block) if parts.base and rng.random() < 0.3 else None
+    if ring is not None and REACH <= ring < len(block) - REACH - 5:
+        farther = int(rng.integers(1, 6))
+        block = long_walled(block, ring, farther)
+        middle, end = ring + int(rng.integers(-1, farther + 3)), 0
+    middle = int(np.clip(middle, REACH, len(block) - REACH - 1))
+    planes = block[middle - REACH : middle + REACH + 1]
+    if parts.fine:
+        planes = whole_septum(planes)
+    if parts.rims and rng.random() < 0.4:
+        planes = thin_walled(planes, int(rng.integers(1, 4)))
+    if parts.fine and rng.random() < 0.45:
+        planes = thick_walled(rng, planes, rng.choice([5.5, 9.0]) if parts.base else 4.0)
+    return planes, end
 
 
 def _draw_plane(rng: np.random.Generator, block: Label) -> tuple[int, int]:
@@ -177,113 +190,6 @@ def _draw_grazing_plane(rng: np.random.Generator, block: Label) -> int:
     area = (labels == LABEL_OF[tissue]).sum(axis=(1, 2))
     little = first + np.flatnonzero((area > 0) & (area < 0.25 * area.max()))
     return int(rng.choice(little) if len(little) else rng.integers(first, last + 1))
-
-
-def thin_walled(planes: Label, layers: int) -> Label:
-    """The same heart with its left ventricle's muscle thinner by some pixels on the outside.
-
-    What lies against the muscle takes the place of its outer layers, but two pixels of muscle
-    stay around the cavity.
-
-    Parameters
-    ----------
-    planes
-        ``(plane, row, column)`` tissue.
-    layers
-        Pixels taken away along rows and columns.
-    """
-    found = np.argwhere((planes == Tissue.LV_MYOCARDIUM).any(axis=0))
-    if not len(found):
-        return planes
-    (top, left), (bottom, right) = np.maximum(found.min(axis=0) - 1, 0), found.max(axis=0) + 2
-    thinner = planes.copy()
-    for plane in thinner:
-        part = plane[top:bottom, left:right]
-        cavity = np.isin(part, _WITHIN_MUSCLE).astype(np.uint8)
-        free = (part == Tissue.LV_MYOCARDIUM) & (cv2.dilate(cavity, np.ones((5, 5), np.uint8)) == 0)
-        for _ in range(layers):
-            beside = part.copy()
-            for step, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
-                shifted = np.roll(beside, step, axis)
-                outer = free & (part == Tissue.LV_MYOCARDIUM)
-                outer &= ~np.isin(shifted, (*_WITHIN_MUSCLE, Tissue.LV_MYOCARDIUM, Tissue.SCAR))
-                part[outer] = shifted[outer]
-    return thinner
-
-
-def whole_septum(planes: Label) -> Label:
-    """The same heart with no wall of the right ventricle between its cavity and the left's muscle.
-
-    Blocks have stray pixels of it there, which thinner walls would draw out to fingers.
-
-    Parameters
-    ----------
-    planes
-        ``(plane, row, column)`` tissue.
-    """
-    brush = np.ones((3, 3), np.uint8)
-    whole = planes.copy()
-    for plane in whole:
-        between = plane == Tissue.RV_WALL
-        for beside in ((Tissue.LV_MYOCARDIUM,), (Tissue.RV_CAVITY, Tissue.RV_TRABECULA)):
-            between &= cv2.dilate(np.isin(plane, beside).astype(np.uint8), brush) > 0
-        plane[between] = Tissue.LV_MYOCARDIUM
-    return whole
-
-
-def thick_walled(rng: np.random.Generator, planes: Label) -> Label:
-    """The same heart with its left ventricle's muscle grown outwards, here more and there less.
-
-    How thick a wall is then tells nothing of where it ends: the edge in the image has to. Muscle
-    takes the place of what lies outside the heart alone.
-
-    Parameters
-    ----------
-    planes
-        ``(plane, row, column)`` tissue.
-    """
-    uneven = smooth_noise(rng, planes.shape[-1], int(rng.integers(4, 9)))
-    grown_px = rng.uniform(-1.0, 4.0) + rng.uniform(0.0, 2.5) * uneven
-    thicker = planes.copy()
-    for plane in thicker:
-        muscle = np.isin(plane, (Tissue.LV_MYOCARDIUM, Tissue.SCAR))
-        if muscle.any():
-            away_px = cv2.distanceTransform((~muscle).astype(np.uint8), cv2.DIST_L2, 3)
-            free = ~IN_HEART[plane] | (plane == Tissue.PERICARDIUM)
-            plane[free & (away_px < np.clip(grown_px, 0, 6) + 0.5)] = Tissue.LV_MYOCARDIUM
-    return thicker
-
-
-def laid_bare(rng: np.random.Generator, planes: Label, skin: bool = True) -> Label:
-    """The same heart with what lies around it reaching up to it in places.
-
-    Fat and pericardium near the heart become the nearest of lung, organs and diaphragm; with
-    ``skin``, one pixel of pericardium stays in half of all hearts.
-
-    Parameters
-    ----------
-    planes
-        ``(plane, row, column)`` tissue.
-    """
-    reach_px, skin_px = rng.uniform(3.0, 14.0), int(rng.integers(0, 2)) * skin
-    chosen = smooth_noise(rng, planes.shape[-1], int(rng.integers(2, 6))) > rng.uniform(-2.5, 0.3)
-    bare = planes.copy()
-    for plane in bare:
-        around = _AROUND[plane]
-        if not around.any():
-            continue
-        away = cv2.distanceTransform((~IN_HEART[plane]).astype(np.uint8), cv2.DIST_L2, 3)
-        _, nearest = cv2.distanceTransformWithLabels(
-            (~around).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        tissue = np.zeros(nearest.max() + 1, np.uint8)
-        tissue[nearest[around]] = plane[around]
-        near = _COVERS[plane] & (away < reach_px) & chosen
-        if skin_px:
-            plane[near & (away <= skin_px)] = Tissue.PERICARDIUM
-        far = near & (away > skin_px)
-        plane[far] = tissue[nearest[far]]
-    return bare
 
 
 def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Places:

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from pipeline.geometry import Float32, Integer, Label, Mask
+from pipeline.geometry import Float, Float32, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.view import PIXEL_MM
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
-RIGHT, AORTA = LABELS["rv_cavity"], LABELS["aorta"]
+AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
@@ -53,8 +53,30 @@ leaves of one."""
 OPENINGS = ("left_atrium", "aorta")
 """What the left ventricle's cavity opens into."""
 
+LEAST_CUT = 0.1
+"""A smaller share of the ventricle's widest cut does not make a plane its tip."""
+
 CLOSED_SHARE = 0.6
 """A cavity with this share of muscle about it is taken for a ring that must be closed."""
+
+
+def clear_apex(value: Float32) -> None:
+    """Take left atrium and aorta from the apical half of the left ventricle, in place.
+
+    A stomach beside the tip is as round and grey as an atrium.
+
+    Parameters
+    ----------
+    value
+        ``(phase, plane, class, row, column)``, planes from the apex to the base.
+    """
+    cuts = _ventricle_cuts(value)
+    widest = int(cuts.argmax())
+    tip = int((cuts > LEAST_CUT * cuts[widest]).argmax())
+    low = value[:, : tip + (widest - tip) // 2]
+    for name in OPENINGS:
+        low[:, :, 0] += low[:, :, LABELS[name]]
+        low[:, :, LABELS[name]] = 0
 
 
 def clean_cycle(value: Float32, pixel_mm: float = PIXEL_MM) -> None:
@@ -82,15 +104,18 @@ def ventricle_tip(value: Float32) -> int:
     From its widest plane towards the tip the ventricle ends where it would leap to a larger cut:
     bright fat around the tip looks like a cavity, and its rim like muscle.
     """
-    cuts = np.zeros(value.shape[1])
-    for probability in value:
-        drawn = probability.argmax(axis=1)
-        cuts += ((drawn == CAVITY) | (drawn == MUSCLE)).sum(axis=(1, 2))
-    cuts /= len(value)
+    cuts = _ventricle_cuts(value)
     for number in range(int(cuts.argmax()) - 1, -1, -1):
         if _leaps(cuts[number], cuts[number + 1]):
             return number + 1
     return 0
+
+
+def _ventricle_cuts(value: Float32) -> Float:
+    """Pixels of the left ventricle on each plane, mean over the phases."""
+    drawn = (probability.argmax(axis=1) for probability in value)
+    cuts = [np.isin(labels, (CAVITY, MUSCLE)).sum(axis=(1, 2)) for labels in drawn]
+    return np.asarray(np.mean(cuts, axis=0))
 
 
 def clean_probability(
@@ -127,7 +152,7 @@ def clean_probability(
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
     _join_auricle(part)
-    _part_outflow(part, pixel_mm)
+    _part_from_right_heart(part, pixel_mm)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
     whole = (labels > 0) | enclosed
@@ -206,30 +231,31 @@ def _join_auricle(part: Float32) -> None:
             part[:, value][neck] = 1.0
 
 
-def _part_outflow(part: Float32, pixel_mm: float) -> None:
-    """Take from the aorta what goes on towards the apex as right ventricle, in place.
+def _part_from_right_heart(part: Float32, pixel_mm: float) -> None:
+    """Take from the aorta what goes on towards the apex as right heart, in place.
 
-    Beside the aorta's root the right ventricle's outflow looks like a second vessel. It is told by
-    the two discs that stand side by side in a plane, one of them on the ventricle's own label.
+    Beside the aorta's root the right ventricle's outflow and the right atrium look like a second
+    vessel: of the discs that stand side by side in a plane, those on the right heart's labels.
     """
     from skimage.morphology import h_maxima
     from skimage.segmentation import watershed
 
     labels = part.argmax(axis=1)
-    right = labels == RIGHT
-    outflow, root = np.zeros((2, *labels.shape), bool)
+    right = np.isin(labels, RIGHT_HEART)
+    root = np.zeros(labels.shape, bool)
     for number, plane in enumerate(labels == AORTA):
         if not plane.any():
             continue
         depth = cv2.distanceTransform(plane.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
         discs = watershed(-depth, middles, mask=plane)
-        beneath = right[number - 1] | outflow[number - 1] if number else np.zeros_like(plane)
+        beneath = right[number - 1] if number else np.zeros_like(plane)
         for disc in range(1, count + 1):
             one = discs == disc
-            (outflow if beneath[one].mean() > 0.5 else root)[number] |= one
-    if (outflow.any(axis=(1, 2)) & root.any(axis=(1, 2))).any():
-        part[:, AORTA] *= ~outflow
+            (right if beneath[one].mean() > 0.5 else root)[number] |= one
+    taken = (labels == AORTA) & right
+    if (taken.any(axis=(1, 2)) & root.any(axis=(1, 2))).any():
+        part[:, AORTA] *= ~taken
 
 
 def _keep_bodies(part: Float32) -> None:

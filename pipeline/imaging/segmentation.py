@@ -12,7 +12,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cleanup import clean_cycle
+from pipeline.imaging.cleanup import clean_cycle, clear_apex
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
@@ -102,6 +102,7 @@ def segment_cine(
     _require_contrast(cine)
     place = locate_heart(cine)
     found = label_probability(cine, place.view, settings.most_views, progress)
+    clear_apex(found.value)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
     seen = _drawn(found)
     _require_ring(seen, found.view)
