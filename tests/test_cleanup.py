@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.imaging.cleanup import clean_cycle, clean_probability, clear_apex, ventricle_tip
+from pipeline.imaging.cleanup import clean_cycle, clean_probability, ventricle_tip
 
 SIDE, PIXEL_MM = 64, 1.5
-CAVITY, MUSCLE, RV, ATRIUM, AORTA = 1, 2, 3, 4, 6
+CAVITY, MUSCLE, RV, ATRIUM = 1, 2, 3, 4
 Y, X = np.mgrid[:SIDE, :SIDE]
 RADIUS = np.hypot(X - 32, Y - 32)
 
@@ -103,46 +103,6 @@ def test_muscle_without_cavity_between_two_rings_gets_the_cavity_that_both_share
     found = cleaned(heart)
     np.testing.assert_array_equal(found[1] == CAVITY, RADIUS < 10)
     np.testing.assert_array_equal(found[[0, 2]], whole[[0, 2]])
-
-
-ROOT, OUTFLOW = np.hypot(X - 36, Y - 36) < 9, np.hypot(X - 22, Y - 26) < 9
-
-
-def base_of_heart(*upper):
-    """A ventricle's ring and the right ventricle before it, and planes above them."""
-    below = np.where(OUTFLOW, RV, ring(10, 13))
-    return np.stack([below] * 3 + list(upper))
-
-
-def test_an_outflow_taken_for_a_second_aorta_is_the_right_ventricles():
-    two = np.where(ROOT | OUTFLOW, AORTA, 0)
-    # Most labels are sure; of the outflow the network is in doubt, and right ventricle comes next.
-    soft = one_hot(base_of_heart(two, two))
-    soft[3:, RV] += 0.4 * OUTFLOW
-    found = clean_probability(soft, pixel_mm=PIXEL_MM).argmax(axis=1)
-    # Where they touch, a lattice decides about pixels.
-    seam = ROOT & (np.hypot(X - 22, Y - 26) < 10)
-    for plane in found[3:]:
-        np.testing.assert_array_equal(plane[ROOT & ~seam], AORTA)
-        np.testing.assert_array_equal(plane[OUTFLOW & ~ROOT], RV)
-
-
-def test_an_aorta_alone_stays_whatever_lies_beneath_it():
-    alone = np.where(OUTFLOW, AORTA, 0)
-    heart = base_of_heart(alone, alone)
-    np.testing.assert_array_equal(cleaned(heart)[3:] == AORTA, heart[3:] == AORTA)
-
-
-def test_no_atrium_lies_beside_the_tip():
-    heart = np.stack([np.zeros_like(ring()), *(ring(2 + 3 * k, 8 + 3 * k) for k in range(5))])
-    round_thing = np.hypot(X - 8, Y - 8) < 7
-    low, high = heart.copy(), heart.copy()
-    low[:2, round_thing] = ATRIUM
-    high[3:, round_thing] = ATRIUM
-    value = one_hot(np.stack([low, high]))
-    clear_apex(value)
-    np.testing.assert_array_equal(value.argmax(axis=2), np.stack([heart, high]))
-    np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-6)
 
 
 def test_the_tip_is_the_same_in_every_phase():

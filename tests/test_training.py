@@ -288,6 +288,14 @@ def test_training_ends_half_way_where_asked(blocks, tmp_path):
     torch.testing.assert_close(found[name], (begun[name] + reached[name]) / 2, rtol=0, atol=1e-8)
 
 
+def test_half_way_from_nowhere_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as refused:
+        main(["--out", str(tmp_path / "new"), "--halfway"])
+    assert refused.value.code == 2
+    assert "--halfway needs --start" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
     import data_synth.training.pool as pool
 

@@ -42,7 +42,7 @@ class TrainSettings:
     halfway: bool = False
     """End half-way between the weights of ``start`` and those learned since: what is new is learned
     and what was known kept (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
-    """
+    Running statistics are averaged like weights. What is exported on the way is not half-way."""
 
     parts: Parts = ALL_PARTS
     """What is drawn at random in the images."""

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from pipeline.geometry import Float, Float32, Integer, Label, Mask
+from pipeline.geometry import Float32, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
 from pipeline.imaging.view import PIXEL_MM
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
-AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
@@ -30,9 +30,6 @@ NECK_BRUSH[1] = np.hypot(*np.mgrid[-2:3, -2:3]) < 2.5
 NECK_BRUSH[[0, 2], 1:4, 1:4] = True
 """What is painted about the way: two pixels in its plane, one in the planes beside it."""
 
-WAIST_MM = 1.5
-"""Two discs are told apart where each is wider than the waist between them by twice this."""
-
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
 
@@ -50,33 +47,8 @@ LEAST_WALL_MM = 3.0
 """Thickness at which a wall that the labels interrupt is closed; also what smoothing the cavity
 leaves of one."""
 
-OPENINGS = ("left_atrium", "aorta")
-"""What the left ventricle's cavity opens into."""
-
-LEAST_CUT = 0.1
-"""A smaller share of the ventricle's widest cut does not make a plane its tip."""
-
 CLOSED_SHARE = 0.6
 """A cavity with this share of muscle about it is taken for a ring that must be closed."""
-
-
-def clear_apex(value: Float32) -> None:
-    """Take left atrium and aorta from the apical half of the left ventricle, in place.
-
-    A stomach beside the tip is as round and grey as an atrium.
-
-    Parameters
-    ----------
-    value
-        ``(phase, plane, class, row, column)``, planes from the apex to the base.
-    """
-    cuts = _ventricle_cuts(value)
-    widest = int(cuts.argmax())
-    tip = int((cuts > LEAST_CUT * cuts[widest]).argmax())
-    low = value[:, : tip + (widest - tip) // 2]
-    for name in OPENINGS:
-        low[:, :, 0] += low[:, :, LABELS[name]]
-        low[:, :, LABELS[name]] = 0
 
 
 def clean_cycle(value: Float32, pixel_mm: float = PIXEL_MM) -> None:
@@ -104,18 +76,11 @@ def ventricle_tip(value: Float32) -> int:
     From its widest plane towards the tip the ventricle ends where it would leap to a larger cut:
     bright fat around the tip looks like a cavity, and its rim like muscle.
     """
-    cuts = _ventricle_cuts(value)
+    cuts = ventricle_cuts(value)
     for number in range(int(cuts.argmax()) - 1, -1, -1):
         if _leaps(cuts[number], cuts[number + 1]):
             return number + 1
     return 0
-
-
-def _ventricle_cuts(value: Float32) -> Float:
-    """Pixels of the left ventricle on each plane, mean over the phases."""
-    drawn = (probability.argmax(axis=1) for probability in value)
-    cuts = [np.isin(labels, (CAVITY, MUSCLE)).sum(axis=(1, 2)) for labels in drawn]
-    return np.asarray(np.mean(cuts, axis=0))
 
 
 def clean_probability(
@@ -152,7 +117,7 @@ def clean_probability(
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
     _join_auricle(part)
-    _part_from_right_heart(part, pixel_mm)
+    part_from_right_heart(part, pixel_mm)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
     whole = (labels > 0) | enclosed
@@ -169,7 +134,7 @@ def clean_probability(
     _close_ring(part, pixel_mm)
     total = part.sum(axis=1, keepdims=True)
     # All classes ruled out: background is what is left.
-    part[:, 0] = np.where(total[:, 0] > 0, part[:, 0], 1)
+    part[:, 0] = np.where(total[:, 0] > 1e-6, part[:, 0], 1)
     part /= np.maximum(part.sum(axis=1, keepdims=True), 1e-6)
     return cleaned
 
@@ -229,33 +194,6 @@ def _join_auricle(part: Float32) -> None:
             neck[tuple(way.T)] = True
             neck = ndimage.binary_dilation(neck, NECK_BRUSH) & passable
             part[:, value][neck] = 1.0
-
-
-def _part_from_right_heart(part: Float32, pixel_mm: float) -> None:
-    """Take from the aorta what goes on towards the apex as right heart, in place.
-
-    Beside the aorta's root the right ventricle's outflow and the right atrium look like a second
-    vessel: of the discs that stand side by side in a plane, those on the right heart's labels.
-    """
-    from skimage.morphology import h_maxima
-    from skimage.segmentation import watershed
-
-    labels = part.argmax(axis=1)
-    right = np.isin(labels, RIGHT_HEART)
-    root = np.zeros(labels.shape, bool)
-    for number, plane in enumerate(labels == AORTA):
-        if not plane.any():
-            continue
-        depth = cv2.distanceTransform(plane.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
-        discs = watershed(-depth, middles, mask=plane)
-        beneath = right[number - 1] if number else np.zeros_like(plane)
-        for disc in range(1, count + 1):
-            one = discs == disc
-            (right if beneath[one].mean() > 0.5 else root)[number] |= one
-    taken = (labels == AORTA) & right
-    if (taken.any(axis=(1, 2)) & root.any(axis=(1, 2))).any():
-        part[:, AORTA] *= ~taken
 
 
 def _keep_bodies(part: Float32) -> None:

@@ -12,7 +12,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cleanup import clean_cycle, clear_apex
+from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
@@ -24,6 +24,7 @@ from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
+from pipeline.imaging.lookalikes import clear_apex
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import PIXEL_MM, Orientation, View
 

@@ -1,0 +1,110 @@
+"""What looks like the aorta or the left atrium and is not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from pipeline.geometry import Float, Float32, Mask
+from pipeline.imaging.labels import LABELS
+
+VENTRICLE = (LABELS["lv_cavity"], LABELS["lv_myocardium"])
+AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
+
+OPENINGS = ("left_atrium", "aorta")
+"""What the left ventricle's cavity opens into."""
+
+WAIST_MM = 1.5
+"""Two discs are told apart where each is wider than the waist between them by twice this."""
+
+SHARED = 0.15
+"""Share of a disc that stands on the right heart, and on the aorta's root, where it is both."""
+
+LEAST_DISC_MM2, LEAST_ROOT = 100.0, 0.25
+"""The root must be this large beside the other disc, and this share of all that is taken: else it
+is the root itself that stands on wrong labels, with a stray spot beside it."""
+
+LEAST_CUT = 0.1
+"""A smaller share of the ventricle's widest cut does not make a plane its tip."""
+
+
+def clear_apex(value: Float32) -> None:
+    """Take left atrium and aorta from planes that are nearer to the tip than to the widest cut.
+
+    A stomach beside the tip of the left ventricle is as round and grey as an atrium. Changes
+    ``value`` in place; the background has what they had.
+
+    Parameters
+    ----------
+    value
+        ``(phase, plane, class, row, column)``, planes from the apex to the base.
+    """
+    cuts = ventricle_cuts(value)
+    widest = int(cuts.argmax())
+    tip = int((cuts > LEAST_CUT * cuts[widest]).argmax())
+    low = value[:, : tip + (widest - tip) // 2]
+    for name in OPENINGS:
+        low[:, :, 0] += low[:, :, LABELS[name]]
+        low[:, :, LABELS[name]] = 0
+
+
+def ventricle_cuts(value: Float32) -> Float:
+    """Pixels of the left ventricle on each plane, mean over the phases."""
+    drawn = (probability.argmax(axis=1) for probability in value)
+    cuts = [np.isin(labels, VENTRICLE).sum(axis=(1, 2)) for labels in drawn]
+    return np.asarray(np.mean(cuts, axis=0))
+
+
+def part_from_right_heart(part: Float32, pixel_mm: float) -> None:
+    """Take from the aorta what goes on towards the apex as right heart, in place.
+
+    Beside the aorta's root the right ventricle's outflow and the right atrium look like a second
+    vessel: of the discs that stand side by side in a plane, those on the right heart's labels.
+    Right heart or background takes over there, whichever is more probable.
+    """
+    labels = part.argmax(axis=1)
+    right, root = np.isin(labels, RIGHT_HEART), np.zeros(labels.shape, bool)
+    taken = np.zeros(labels.shape, bool)
+    for number, plane in enumerate(labels == AORTA):
+        beneath = right[number - 1] if number else np.zeros_like(plane)
+        for disc in _discs(plane, pixel_mm):
+            # Where two discs have melted into one, each pixel goes with the nearer one beneath.
+            shared = number > 0 and min(beneath[disc].mean(), root[number - 1][disc].mean())
+            if shared > SHARED:
+                to_right = ndimage.distance_transform_edt(~beneath)
+                taken[number] |= disc & (
+                    to_right < ndimage.distance_transform_edt(~root[number - 1])
+                )
+            elif beneath[disc].mean() > 0.5:
+                taken[number] |= disc
+        right[number] |= taken[number]
+        root[number] = plane & ~taken[number]
+    # A spot of aorta elsewhere is no root.
+    disc_pixels = LEAST_DISC_MM2 / pixel_mm**2
+    beside = (taken.sum(axis=(1, 2)) > disc_pixels) & (root.sum(axis=(1, 2)) > disc_pixels)
+    if beside.any() and root.sum() > LEAST_ROOT * taken.sum():
+        _hand_on(part, taken)
+
+
+def _hand_on(part: Float32, taken: Mask) -> None:
+    """Leave background and right heart alone, the more probable with all that others had."""
+    chance = np.moveaxis(part, 1, -1)
+    heirs = np.array([0, *RIGHT_HEART])
+    left = np.zeros((np.count_nonzero(taken), part.shape[1]), np.float32)
+    left[:, heirs] = chance[taken][:, heirs]
+    left[np.arange(len(left)), heirs[left[:, heirs].argmax(axis=1)]] += 1 - left.sum(axis=1)
+    chance[taken] = left
+
+
+def _discs(plane: Mask, pixel_mm: float) -> list[Mask]:
+    """Parts of a plane's label that waists part."""
+    from skimage.morphology import h_maxima
+    from skimage.segmentation import watershed
+
+    if not plane.any():
+        return []
+    depth = cv2.distanceTransform(plane.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
+    parts = watershed(-depth, middles, mask=plane)
+    return [parts == number for number in range(1, count + 1)]
