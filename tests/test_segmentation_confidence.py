@@ -17,7 +17,7 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import cut_off, segment_cine
+from pipeline.imaging.segmentation import _require_right_ventricle, cut_off, segment_cine
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import view_of
 
@@ -266,3 +266,19 @@ def test_a_stack_that_ends_too_soon_is_known_by_its_last_cuts(radii, found):
     both = np.concatenate([labels, np.where(disc, LABELS["aorta"], 0).astype(np.uint8)[None]])
     others = {"aorta": found["left ventricle"]} if found else {}
     assert cut_off(both) == found | others
+
+
+@pytest.mark.parametrize(
+    ("right", "atria", "refused"),
+    [(0, 900, True), (60, 900, True), (400, 900, False), (0, 0, False)],
+)
+def test_left_ventricle_and_atria_without_a_right_ventricle_are_no_heart(right, atria, refused):
+    """A stomach and a vessel beside it; a stack of the tip alone shows no atrium either."""
+    drawn = np.zeros((2, 3, 64, 64), np.uint8)
+    for value, pixels in ((1, 600), (2, 700), (3, right), (5, atria)):
+        drawn.reshape(2, 3, -1)[:, :, 700 * value : 700 * value + pixels // 3] = value
+    if not refused:
+        _require_right_ventricle(drawn)
+        return
+    with pytest.raises(StageError, match=r"slices 0 to 2: no heart found: .* at least 10 % were"):
+        _require_right_ventricle(drawn)

@@ -33,6 +33,10 @@ Progress = Callable[[int, int], None]
 LARGEST_BARE = 0.5
 """Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""
 
+LEAST_RIGHT = 0.1
+"""Of the left ventricle with its muscle, or of the atria where they are smaller: hearts of two
+renderers show 0.4 and more, and stacks of the tip alone no atrium."""
+
 MOST_NAMED = 8
 """Images that one message names."""
 
@@ -113,6 +117,7 @@ def segment_cine(
     clean_cycle(found.value)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
+    _require_right_ventricle(drawn)
     crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
     acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
     heart, heart_mr_from_index = _isotropic(found, drawn, settings, crossings, acquired)
@@ -194,6 +199,22 @@ def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> N
             f"left ventricle is {volume_ml.min():.0f} ml, at least "
             f"{settings.min_ventricle_ml:.0f} ml were expected; check the images, or lower "
             "segment.min_ventricle_ml"
+        )
+
+
+def _require_right_ventricle(drawn: Label) -> None:
+    """Refuse what shows a left ventricle and atria, and hardly a right ventricle between them."""
+
+    def pixels(*names: str) -> int:
+        return int(np.isin(drawn, [LABELS[name] for name in names]).sum())
+
+    left, right = pixels("lv_cavity", "lv_myocardium"), pixels("rv_cavity")
+    if right < LEAST_RIGHT * min(left, pixels("left_atrium", "right_atrium")):
+        raise StageError(
+            f"slices 0 to {drawn.shape[1] - 1}: no heart found: beside what looks like a left "
+            f"ventricle and atria lies a right ventricle of {100 * right / left:.0f} % of its size,"
+            f" at least {100 * LEAST_RIGHT:.0f} % were expected; check that the study is a cardiac "
+            "cine, and leave series of other parts of the body out"
         )
 
 
