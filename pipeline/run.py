@@ -122,7 +122,8 @@ def run_study(
     forced = STAGE_NAMES[STAGE_NAMES.index(first) :] if first else ()
     with only_run_in(products):
         inputs = _input_digests(study)
-        run = _Run(study, settings, products, watcher, inputs, _previous(products))
+        _require_same_study(study, inputs, products)
+        run = _Run(study, settings, products, watcher, inputs, _earlier_stages(products))
         for stage in wanted:
             _bring_up_to_date(run, stage, force=stage.name in forced)
         _note_later_products(run, STAGES[len(wanted) :])
@@ -231,12 +232,39 @@ def _input_digests(study: Study) -> dict[str, dict[str, str]]:
     }
 
 
-def _previous(products: Path) -> Mapping[str, Any]:
+def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], products: Path) -> None:
+    """Another patient's products under the same patient id are not replaced.
+
+    A study may be moved, or its files exchanged where they are; not both at once.
+    """
+    earlier = _recorded(products)
+    folder, known = earlier.get("study"), earlier.get("inputs")
+    if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study.folder):
+        return
+    before, now = (
+        {k for one in kinds.values() if isinstance(one, dict) for k in one.values()}
+        for kinds in (known, inputs)
+    )
+    if before.isdisjoint(now):
+        raise InputError(
+            f"{products}: holds the products of another study, {folder}, which has the patient id "
+            f"{study.patient_id!r} too and no file in common with {study.folder}; choose another "
+            "--out, or give this study a patient_id of its own in study.yaml"
+        )
+
+
+def _recorded(products: Path) -> Mapping[str, Any]:
+    """What ``run.json`` says, if there is one that can be read."""
     try:
         content = json.loads((products / "run.json").read_text())
-        return content["stages"] if isinstance(content["stages"], dict) else {}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError):
         return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _earlier_stages(products: Path) -> Mapping[str, Any]:
+    stages = _recorded(products).get("stages")
+    return stages if isinstance(stages, dict) else {}
 
 
 def _note(
@@ -260,6 +288,7 @@ def _record(run: _Run, status: str) -> dict[str, Any]:
 
     content = {
         "patient_id": run.study.patient_id,
+        "study": str(run.study.folder),
         "status": status,
         "versions": {
             "beatfield": __version__,

@@ -132,6 +132,22 @@ def test_what_study_yaml_says_of_the_cine_counts_as_input(kitchen: Kitchen, key:
     assert kitchen.run()["a"] == "done"
 
 
+def test_another_study_of_the_same_patient_id_replaces_nothing(kitchen: Kitchen) -> None:
+    kitchen.run()
+    before = kitchen.record()
+    other = kitchen.folder.parent.parent / "elsewhere" / "p1"
+    (other / "cine").mkdir(parents=True)
+    (other / "cine" / "image").write_text("of another patient")
+    with pytest.raises(InputError, match=r"holds the products of another study, .*studies/p1"):
+        runner.run_study(open_study(other), Settings(), kitchen.out, Silent())
+    assert kitchen.record() == before
+    # Moved with its images it is the same study.
+    (other / "cine" / "image").write_text("first")
+    moved = Silent()
+    runner.run_study(open_study(other), Settings(), kitchen.out, moved)
+    assert moved.outcomes == dict.fromkeys("abc", "unchanged")
+
+
 def test_changed_code_runs_again(kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch) -> None:
     kitchen.run()
     monkeypatch.setattr(runner, "code_digest", lambda module: "other code")

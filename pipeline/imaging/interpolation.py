@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.tapering import taper_ventricle
 
 BAND_MM = 4.0
 """Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
@@ -45,6 +46,7 @@ def isotropic_labels(
     reach_mm: float,
     grid_mm: float,
     margin_mm: float,
+    planes_a_slice: int = 1,
 ) -> tuple[Label, Float]:
     """Labels of all phases on one isotropic grid around the heart.
 
@@ -63,6 +65,8 @@ def isotropic_labels(
         outer slice is what volumes summed slice by slice assume.
     grid_mm, margin_mm
         Spacing of the grid, and the empty space around the heart.
+    planes_a_slice
+        The middle one of so many planes is a slice.
 
     Returns
     -------
@@ -73,6 +77,7 @@ def isotropic_labels(
     cut = _cut_around(probability, margin_mm, pixel_mm)
     below_mm, above_mm = plane_mm[0] - reach_mm, plane_mm[-1] + reach_mm
     height_mm = np.arange(below_mm, above_mm + grid_mm, grid_mm)
+    slices = np.arange(planes_a_slice // 2, len(plane_mm), planes_a_slice)
     phases = []
     for one in probability[:, :, :, cut[0], cut[1]]:
         depth_mm = np.stack(
@@ -82,7 +87,14 @@ def isotropic_labels(
             ]
         )
         closed_mm, closed_plane_mm = close_ends(depth_mm, plane_mm, reach_mm)
-        phases.append(interpolate_planes(closed_mm, closed_plane_mm, height_mm))
+        ventricle_mm = np.stack(
+            [ventricle_depth_mm(one[k], pixel_mm, shifts_mm[k], grid_mm) for k in slices]
+        )
+        added = int(np.searchsorted(closed_plane_mm, plane_mm[0]))
+        tapered_mm, tapered_plane_mm = taper_ventricle(
+            closed_mm, closed_plane_mm, slices + added, ventricle_mm, BAND_MM
+        )
+        phases.append(interpolate_planes(tapered_mm, tapered_plane_mm, height_mm))
     volume = np.stack(phases)
     first, last = _heights_with_heart(volume, round(margin_mm / grid_mm))
     first_mm = np.array([cut[1].start * pixel_mm, cut[0].start * pixel_mm, height_mm[first]])
@@ -136,6 +148,16 @@ def plane_depth_mm(
             fine = _magnified(margin, pixel_mm, shift_mm, grid_mm, size)
             depth[value] = _signed_depth_mm(fine, grid_mm)
     return depth
+
+
+def ventricle_depth_mm(
+    probability: Float32, pixel_mm: float, shift_mm: Float, grid_mm: float
+) -> Float32:
+    """As `plane_depth_mm`, of the left ventricle, cavity and muscle as one: ``(row, column)``."""
+    others = [k for k in range(len(probability)) if k not in (CAVITY, MUSCLE)]
+    margin = -class_margins(probability)[others].max(axis=0)
+    size = [int((side - 1) * pixel_mm / grid_mm) + 1 for side in margin.shape]
+    return _signed_depth_mm(_magnified(margin, pixel_mm, shift_mm, grid_mm, size), grid_mm)
 
 
 def class_margins(probability: Float32) -> Float32:

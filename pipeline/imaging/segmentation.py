@@ -44,6 +44,10 @@ LEAST_SHARE = 0.2
 """A slice with less than this share of the heart that both its neighbours show in one place is
 spoilt."""
 
+LEAST_SHARED_MM2 = 100.0
+"""What both neighbours show in one place is no more than stray pixels beyond the tip if it is less:
+a cut 11 mm wide."""
+
 
 BODIES: dict[str, tuple[str, ...]] = {
     "left ventricle": ("lv_cavity", "lv_myocardium"),
@@ -149,16 +153,13 @@ def _require_understood(
     drawn: Label, confidence: Float, view: View, settings: SegmentSettings
 ) -> None:
     """Refuse an image that shows no heart between two that do, or that the network doubts."""
-    heart = drawn > 0
-    # What one of them shows elsewhere, as a vessel or a bowel beyond the tip, is no heart missed.
-    both = (heart[:, :-2] & heart[:, 2:]).sum(axis=(2, 3))
-    gaps = np.argwhere(heart[:, 1:-1].sum(axis=(2, 3)) < LEAST_SHARE * both)
+    gaps = missed_hearts(drawn, view.pixel_mm)
     if len(gaps):
         phase, number = gaps[0]
         raise StageError(
-            f"phase {phase}, slice {view.order[number + 1]}: no heart found, though the slices on "
+            f"phase {phase}, slice {view.order[number]}: no heart found, though the slices on "
             "both sides show it; check this image. To do without the slice, draw it between its "
-            f"neighbours: cine.spoilt_slices: [{view.order[number + 1]}] in study.yaml"
+            f"neighbours: cine.spoilt_slices: [{view.order[number]}] in study.yaml"
         )
     if confidence.min() < settings.min_confidence:
         worst = np.unravel_index(confidence.argmin(), confidence.shape)
@@ -171,6 +172,22 @@ def _require_understood(
             f"{' ...' if len(low) > MOST_NAMED else ''}); check them, do without a slice inside "
             "the stack (cine.spoilt_slices in study.yaml), or lower segment.min_confidence"
         )
+
+
+def missed_hearts(drawn: Label, pixel_mm: float) -> Integer:
+    """Phase and slice, ``(n, 2)``, of images without the heart that both neighbours show.
+
+    Parameters
+    ----------
+    drawn
+        ``(phase, slice, row, column)`` labels.
+    """
+    heart = drawn > 0
+    # What one of them shows elsewhere, as a vessel or a bowel beyond the tip, is no heart missed.
+    both = (heart[:, :-2] & heart[:, 2:]).sum(axis=(2, 3))
+    missed = heart[:, 1:-1].sum(axis=(2, 3)) < LEAST_SHARE * both
+    phases, between = np.nonzero(missed & (both * pixel_mm**2 > LEAST_SHARED_MM2))
+    return np.stack([phases, between + 1], axis=1)
 
 
 def _require_ring(drawn: Label, view: View) -> None:
@@ -246,6 +263,7 @@ def _isotropic(
         view.slice_step_mm / 2 + found.plane_mm[0],
         settings.grid_mm,
         settings.margin_mm,
+        count,
     )
     volume, added = _with_margin(volume, round(settings.margin_mm / settings.grid_mm))
     first_mm = first_mm - (0, 0, added * settings.grid_mm)
