@@ -241,14 +241,13 @@ def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], product
     folder, known = earlier.get("study"), earlier.get("inputs")
     if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study.folder):
         return
-    before, now = (
-        {k for one in kinds.values() if isinstance(one, dict) for k in one.values()}
-        for kinds in (known, inputs)
-    )
-    if before.isdisjoint(now):
+    before, now = (kinds.get("cine") for kinds in (known, inputs))
+    if not before or not now or not any(sealed(products / stage) for stage in STAGE_NAMES):
+        return
+    if set(map(str, before.values())).isdisjoint(now.values()):
         raise InputError(
             f"{products}: holds the products of another study, {folder}, which has the patient id "
-            f"{study.patient_id!r} too and no file in common with {study.folder}; choose another "
+            f"{study.patient_id!r} too and no image in common with {study.folder}; choose another "
             "--out, or give this study a patient_id of its own in study.yaml"
         )
 

@@ -4,11 +4,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline
 
-from pipeline.imaging.interpolation import REFINE, isotropic_labels
+from pipeline.imaging import interpolation
+from pipeline.imaging.interpolation import (
+    BAND_MM,
+    REFINE,
+    close_ends,
+    isotropic_labels,
+    plane_depth_mm,
+    ventricle_depth_mm,
+)
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.tapering import LID_MM
+from pipeline.imaging.tapering import taper_ventricle
 
 PIXEL_MM, SIDE, STEP_MM = 1.5, 72, 10.0
 PLANES = 3
@@ -48,6 +57,17 @@ def volume_of(slice_mm, probability):
     return volume[0], first_mm[2] + 1.5 * np.arange(volume.shape[1])
 
 
+def untapered(slice_mm, probability):
+    """The same volume with the ventricle as the planes show it."""
+    plane_mm = (slice_mm[:, None] + STEP_MM / PLANES * np.array([-1, 0, 1])).ravel()
+    half_mm = STEP_MM / 2 - STEP_MM / PLANES
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interpolation, "taper_ventricle", lambda depth, heights, *_: (depth, heights))
+        return isotropic_labels(
+            probability, PIXEL_MM, plane_mm, np.zeros((len(plane_mm), 2)), half_mm, 1.5, 6.0
+        )[0][0]
+
+
 def found_mm(volume, *values):
     return np.sqrt(np.isin(volume, values).sum(axis=(1, 2)) * 1.5**2 / np.pi)
 
@@ -85,10 +105,15 @@ def test_outlines_of_slices_alone_give_an_ellipsoid(tip_mm, length_mm, widest_mm
 @given(tip_mm=st.floats(-8, -3), growth_mm=st.floats(15, 30))
 @settings(max_examples=15, deadline=None)
 def test_a_paraboloid_ends_at_its_tip(tip_mm, growth_mm):
-    """Its cuts fall in a straight line, which is what is carried on: radius squared by height."""
+    """Its cuts fall in a straight line, which is what is carried on: radius squared by height.
+
+    It stands under a cylinder, which tells nothing of the tip; so does its cavity, 10 to 17 mm
+    above its own.
+    """
     slice_mm = np.arange(-10, 50.1, STEP_MM)
-    outside_mm = np.sqrt(np.maximum(growth_mm * (slice_mm - tip_mm), 0))
-    inside_mm = np.sqrt(np.maximum(growth_mm * (slice_mm - tip_mm) - 250, 0))
+    up_mm = np.minimum(slice_mm - tip_mm, 35)
+    outside_mm = np.sqrt(np.maximum(growth_mm * up_mm, 0))
+    inside_mm = np.sqrt(np.maximum(growth_mm * up_mm - 250, 0))
 
     volume, height_mm = volume_of(slice_mm, drawn(outside_mm, inside_mm))
 
@@ -96,23 +121,68 @@ def test_a_paraboloid_ends_at_its_tip(tip_mm, growth_mm):
     # Cuts counted in pixels put the tip wrong by little more than a grid step.
     assert height_mm[shown][0] == pytest.approx(tip_mm, abs=1.5 + OUTLINE_MM)
     cavity = (volume == CAVITY).any(axis=(1, 2))
-    assert height_mm[cavity][0] - height_mm[shown][0] >= LID_MM - 1.5 / 2
-    under = height_mm < 0
-    truth_mm = np.sqrt(np.maximum(growth_mm * (height_mm - tip_mm), 0))
-    off_mm = found_mm(volume, CAVITY, MUSCLE) - truth_mm
-    # A step up or down of the grid where the tip is steepest.
-    assert np.abs(off_mm[under & shown]).max() < np.sqrt(growth_mm * 1.5) + OUTLINE_MM
+    assert height_mm[cavity][0] == pytest.approx(tip_mm + 250 / growth_mm, abs=1.5 + OUTLINE_MM)
+    # A step of the grid from the tip on, where it is less steep, its roundness shows: the cone
+    # through the last cut would be a quarter of that cut's radius too narrow half-way.
+    under = (height_mm < 0) & (height_mm > tip_mm + 1.5)
+    truth_mm = np.sqrt(growth_mm * (height_mm[under] - tip_mm))
+    moved_mm = np.sqrt(growth_mm * (height_mm[under] - tip_mm + OUTLINE_MM)) - truth_mm
+    off_mm = found_mm(volume, CAVITY, MUSCLE)[under] - truth_mm
+    assert np.all(np.abs(off_mm) < OUTLINE_MM + moved_mm)
 
 
-def test_the_tip_lies_before_the_far_face_of_the_slice_that_does_not_show_it():
-    slice_mm = np.arange(-10, 50.1, STEP_MM)
-    outside_mm = np.where(slice_mm > 5, 28 + slice_mm / 10, 0.0)
+def lowest_mm(volume, height_mm, *values):
+    """Height of the lowest voxel of some classes, and how many they have."""
+    shown = np.isin(volume, values)
+    return height_mm[shown.any(axis=(1, 2))][0], np.count_nonzero(shown)
 
-    volume, height_mm = volume_of(slice_mm, drawn(outside_mm, outside_mm - 8))
 
-    shown = np.isin(volume, (CAVITY, MUSCLE)).any(axis=(1, 2))
-    assert -STEP_MM / 2 - 1.5 <= height_mm[shown][0] < 0
-    assert (np.diff(found_mm(volume, CAVITY, MUSCLE)[shown][:8]) > 0).all()
+def test_a_smaller_last_cut_never_makes_the_tip_longer():
+    """The last slice's cut shrinks to nothing, and the tip moves from below it to above it."""
+    slice_mm = np.arange(0, 60.1, STEP_MM)
+    found = []
+    for last_mm in (12.0, 10.0, 8.0, 6.0, 4.0, 0.0):
+        outside_mm = np.array([last_mm, 22, 25, 27, 28, 28.5, 29])
+        volume, height_mm = volume_of(slice_mm, drawn(outside_mm, outside_mm - 8))
+        found.append(lowest_mm(volume, height_mm, CAVITY, MUSCLE))
+    tips_mm, voxels = np.array(found).T
+    assert np.all(np.diff(tips_mm) >= 0)
+    assert np.all(np.diff(voxels) < 0)
+    # The last slice shows nothing of it, and has nothing of it.
+    assert 0 <= tips_mm[-1] < slice_mm[1]
+
+
+@pytest.mark.parametrize("planes_a_slice", [1, 3])
+def test_what_slices_show_stays_as_it_is(planes_a_slice):
+    """Depth on the slices from the last cut on, and on all planes above the widest."""
+    slice_mm = np.arange(-10, 70.1, STEP_MM)
+    outside_mm = radius_mm(slice_mm, -4, 70, 30) - 0.1 * np.maximum(slice_mm - 40, 0)
+    inside_mm = radius_mm(slice_mm, 3, 70, 23)
+    labels = drawn(outside_mm, inside_mm, right=40)[0]
+    if planes_a_slice == 1:
+        labels, height_mm = labels[1::PLANES], slice_mm
+    else:
+        height_mm = (slice_mm[:, None] + STEP_MM / PLANES * np.array([-1, 0, 1])).ravel()
+    depth_mm = np.stack([plane_depth_mm(one, PIXEL_MM, np.zeros(2), 1.5) for one in labels])
+    depth_mm, height_mm = close_ends(depth_mm, height_mm, 3.0)
+    slices = np.flatnonzero(np.isin(height_mm, slice_mm))
+    ventricle = np.stack(
+        [
+            ventricle_depth_mm(one, PIXEL_MM, np.zeros(2), 1.5)
+            for one in labels[planes_a_slice // 2 :: planes_a_slice]
+        ]
+    )
+
+    tapered_mm, tapered_height_mm = taper_ventricle(depth_mm, height_mm, slices, ventricle, BAND_MM)
+
+    widest = slices[int(outside_mm.argmax())]
+    kept = np.union1d(slices[outside_mm > 0], np.arange(widest, len(height_mm)))
+    where = np.searchsorted(tapered_height_mm, height_mm[kept])
+    np.testing.assert_array_equal(tapered_height_mm[where], height_mm[kept])
+    np.testing.assert_array_equal(tapered_mm[where], np.clip(depth_mm[kept], -BAND_MM, BAND_MM))
+    tapering = tapered_height_mm < height_mm[widest]
+    lowest = np.flatnonzero((tapered_mm[:, [CAVITY, MUSCLE]] > 0).any(axis=(1, 2, 3)))[0]
+    assert np.diff(tapered_height_mm[tapering][lowest:]).max() <= 1.5
 
 
 def test_a_stack_that_cuts_the_ventricle_off_adds_no_more_than_half_a_step():
@@ -144,10 +214,90 @@ def test_chambers_without_muscle_are_left_alone():
     slice_mm = np.arange(-10, 50.1, STEP_MM)
     outside_mm = radius_mm(slice_mm, -4, 70, 30)
     chance = drawn(outside_mm, outside_mm)
+
+    np.testing.assert_array_equal(volume_of(slice_mm, chance)[0], untapered(slice_mm, chance))
+
+
+def test_a_slice_left_out_leaves_no_step():
+    """Radii follow the cubic over a gap of 20 mm as they do elsewhere."""
+    slice_mm = np.array([0.0, 20, 30, 40, 50])
+    outside_mm = np.array([10.0, 26, 29, 31, 31.5])
     plane_mm = (slice_mm[:, None] + STEP_MM / PLANES * np.array([-1, 0, 1])).ravel()
 
-    given_, _ = isotropic_labels(
-        chance, PIXEL_MM, plane_mm, np.zeros((len(plane_mm), 2)), 5 / 3, 1.5, 6.0
+    volume, first_mm = isotropic_labels(
+        drawn(outside_mm, outside_mm - 7), PIXEL_MM, plane_mm, np.zeros((15, 2)), 5 / 3, 1.5, 6.0, 3
     )
 
-    np.testing.assert_array_equal(volume_of(slice_mm, chance)[0], given_[0])
+    height_mm = first_mm[2] + 1.5 * np.arange(volume.shape[1])
+    inner = (height_mm > 0) & (height_mm < 40)
+    slopes = np.gradient(outside_mm, slice_mm, edge_order=2)
+    cubic_mm = CubicHermiteSpline(slice_mm, outside_mm, slopes)(height_mm)
+    off_mm = found_mm(volume[0], CAVITY, MUSCLE) - cubic_mm
+    assert np.abs(off_mm[inner]).max() < OUTLINE_MM
+
+
+def test_the_tip_takes_nothing_from_another_chamber():
+    """A right ventricle that goes on where the left one's last slice is over."""
+    slice_mm = np.arange(0, 60.1, STEP_MM)
+    outside_mm = np.array([0.0, 24, 26, 27, 28, 28.5, 29])
+    chance = drawn(outside_mm, outside_mm - 8, right=45)
+    before = untapered(slice_mm, chance)
+
+    after, height_mm = volume_of(slice_mm, chance)
+
+    # Planes of the first slice show it whole; the next one, of the second slice, its lesser part.
+    low = height_mm < STEP_MM / PLANES
+    assert (before[low] == RIGHT).any()
+    np.testing.assert_array_equal(after[low] == RIGHT, before[low] == RIGHT)
+
+
+def test_no_muscle_grows_across_the_valve():
+    """A cavity that borders on the left atrium on its slices does so between them."""
+    slice_mm = np.arange(-10, 70.1, STEP_MM)
+    outside_mm = radius_mm(slice_mm, -4, 80, 30)
+    inside_mm = radius_mm(slice_mm, 3, 80, 23)
+    axis = np.arange(SIDE) * PIXEL_MM - CENTRE_MM
+    beside = np.broadcast_to(axis > 20, (SIDE, SIDE))
+    chance = drawn(outside_mm, inside_mm)
+    for plane, inner_mm in zip(chance[0], np.repeat(inside_mm, PLANES), strict=True):
+        if inner_mm > 20.5:
+            plane[:, beside] = 0
+            plane[LABELS["left_atrium"], beside] = 1
+
+    volume, height_mm = volume_of(slice_mm, chance)
+
+    open_mm = slice_mm[inside_mm > 20.5]
+    rows = volume[(height_mm > open_mm[0]) & (height_mm < open_mm[-1]), SIDE // 2]
+    for row in rows:
+        cavity = np.flatnonzero(row == CAVITY)
+        assert row[cavity[-1] + 1] == LABELS["left_atrium"]
+
+
+def test_cavity_and_background_never_touch():
+    """Where the wall leans so far that the slice's cavity is wider than the outside beside it."""
+    slice_mm = np.arange(0, 50.1, STEP_MM)
+    outside_mm = np.array([8.0, 30, 31, 32, 32.5, 33])
+
+    volume, height_mm = volume_of(slice_mm, drawn(outside_mm, outside_mm - 4))
+
+    cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)
+    for plane in volume[height_mm < 45]:
+        assert not (ndimage.binary_dilation(plane == CAVITY, cross) & (plane == 0)).any()
+
+
+def test_outlines_stay_within_those_of_the_slices_on_both_sides():
+    """A cubic that turns off sharply would overshoot by 2.6 mm."""
+    slice_mm = np.arange(0, 40.1, STEP_MM)
+    outside_mm = np.array([0, 8, 30, 30.4, 25])
+
+    volume, _ = volume_of(slice_mm, drawn(outside_mm, outside_mm - 7))
+
+    assert found_mm(volume, CAVITY, MUSCLE).max() < 30.4 + OUTLINE_MM
+
+
+def test_a_ventricle_that_a_slice_interrupts_is_left_alone():
+    slice_mm = np.arange(0, 60.1, STEP_MM)
+    outside_mm = np.array([12.0, 18, 0, 24, 26, 27, 28])
+    chance = drawn(outside_mm, outside_mm - 7)
+
+    np.testing.assert_array_equal(volume_of(slice_mm, chance)[0], untapered(slice_mm, chance))
