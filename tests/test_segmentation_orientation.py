@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from data_synth.mr import MrSettings, acquire_cine
 from data_synth.population import draw_heart
-from pipeline.imaging import orientation, view
+from pipeline.imaging import inference, orientation, view
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.inference import TURNS_DEG, count_turns
 from pipeline.imaging.labels import LABELS
@@ -273,3 +273,26 @@ def test_view_can_be_asked_for_in_another_orientation():
     plain = view.view_of(cine)
     np.testing.assert_allclose(turned.axes[0], plain.axes[1], atol=1e-12)
     assert turned.order == plain.order[::-1]
+
+
+@pytest.mark.parametrize(("ways", "alone"), [(1, 0), (2, 0), (5, 1)])
+def test_one_look_of_several_goes_without_the_slice_towards_the_apex(
+    study, monkeypatch, ways, alone
+):
+    cine = study[0]
+    shown = []
+
+    def predict(images):
+        shown.append(images)
+        return np.full((len(images), 3, 7, *images.shape[2:]), 1 / 7, np.float32)
+
+    monkeypatch.setattr(inference, "predict", predict)
+    # As wide as the field, at 4 mm a pixel: what is in the images does not matter here.
+    inference.label_probability(cine, view_of(cine).varied(scale=2.0), ways)
+
+    assert len(shown) == 2 * ways
+    without = [bool((look[:, 0] == look[:, 1]).all()) for look in shown]
+    assert sum(without) == 2 * alone
+    for look, own in zip(shown, without, strict=True):
+        np.testing.assert_array_equal(look[1:-1, 2], look[2:, 1])
+        np.testing.assert_array_equal(look[1:, 0], look[1:, 1] if own else look[:-1, 1])
