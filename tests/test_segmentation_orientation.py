@@ -291,8 +291,10 @@ def test_one_look_of_several_goes_without_the_slice_towards_the_apex(
     inference.label_probability(cine, view_of(cine).varied(scale=2.0), ways)
 
     assert len(shown) == 2 * ways
-    without = [bool((look[:, 0] == look[:, 1]).all()) for look in shown]
+    # Of nine slices the four nearest the apex; the first has no neighbour there anyway.
+    without = [bool((look[:4, 0] == look[:4, 1]).all()) for look in shown]
     assert sum(without) == 2 * alone
     for look, own in zip(shown, without, strict=True):
-        np.testing.assert_array_equal(look[1:-1, 2], look[2:, 1])
-        np.testing.assert_array_equal(look[1:, 0], look[1:, 1] if own else look[:-1, 1])
+        np.testing.assert_array_equal(look[:-1, 2], look[1:, 1])
+        first = 4 if own else 1
+        np.testing.assert_array_equal(look[first:, 0], look[first - 1 : -1, 1])
