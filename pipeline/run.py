@@ -242,7 +242,9 @@ def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], product
     if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study.folder):
         return
     before, now = (kinds.get("cine") for kinds in (known, inputs))
-    if not before or not now or not any(sealed(products / stage) for stage in STAGE_NAMES):
+    if not isinstance(before, dict) or not before or not now:
+        return
+    if not any(sealed(products / stage) for stage in STAGE_NAMES):
         return
     if set(map(str, before.values())).isdisjoint(now.values()):
         raise InputError(
