@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
-from pipeline.imaging.labels import LABELS
-from pipeline.imaging.tapering import taper_ventricle
+from pipeline.imaging.tapering import CAVITY, LID_MM, MUSCLE, taper_ventricle
 
 BAND_MM = 4.0
 """Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
@@ -23,13 +22,8 @@ by a third of this at its rim."""
 TAPER_MM = 10.0
 """How a structure tapers towards an end of the stack is told by its areas this near to it."""
 
-LID_MM = 2.0
-"""Muscle below the cavity at the tip of the left ventricle, where no slice shows it."""
-
 CAP_STEP_MM = 1.5
 """Distance of the planes by which ends are rounded off."""
-
-CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
 EDGE_PX = 0.8
 """Standard deviation, pixels, by which class margins are smoothed: what they decide has stairs."""
