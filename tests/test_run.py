@@ -148,6 +148,19 @@ def test_another_study_of_the_same_patient_id_replaces_nothing(kitchen: Kitchen)
     assert moved.outcomes == dict.fromkeys("abc", "unchanged")
 
 
+@pytest.mark.parametrize("known", [[], {"cine": ["image"]}, {"cine": {"image": []}}, {"cine": {}}])
+def test_inputs_in_a_damaged_record_stop_no_run(kitchen: Kitchen, known: Any) -> None:
+    """What cannot be compared is no reason to refuse, but other images are: a list is no digest."""
+    kitchen.run()
+    record = kitchen.record() | {"study": "/elsewhere", "inputs": known}
+    (kitchen.out / "p1" / "run.json").write_text(json.dumps(record))
+    if known == {"cine": {"image": []}}:
+        with pytest.raises(InputError, match=r"products of another study, /elsewhere"):
+            kitchen.run()
+    else:
+        assert kitchen.run() == dict.fromkeys("abc", "unchanged")
+
+
 def test_changed_code_runs_again(kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch) -> None:
     kitchen.run()
     monkeypatch.setattr(runner, "code_digest", lambda module: "other code")
