@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from data_synth.tissue import Tissue
 from data_synth.training.contrast import IS_BLOOD, USUAL_CONTRAST
 from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
+from data_synth.training.ends import first_ventricle, low_atrium, lowest_atrium, other_tip
 from data_synth.training.faults import windowed
 from data_synth.training.render import _other_sizes
 from data_synth.training.walls import last_ring, long_walled, thick_walled, whole_septum
@@ -120,6 +122,78 @@ def test_a_long_walled_ventricle_goes_on_as_it_was_beside_what_lies_there():
             np.testing.assert_array_equal(plane == tissue, kept)
 
 
+def valve_planes():
+    """Six rings, then both atria with the right ventricle's outflow before the right one."""
+    below = short_axis(Tissue.FAT)
+    above = np.full((SIDE, SIDE), Tissue.FAT, np.uint8)
+    above[np.hypot(ROWS - 42, COLUMNS - 12) < 12] = Tissue.RIGHT_ATRIUM
+    above[np.hypot(ROWS - 14, COLUMNS - 18) < 8] = Tissue.RV_CAVITY
+    above[AWAY < 16] = Tissue.LEFT_ATRIUM
+    return np.stack([below] * 6 + [above] * 3)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_low_right_atrium_takes_the_ventricle_from_behind_and_nothing_else(seed):
+    planes = valve_planes()
+    assert lowest_atrium(planes) == 6
+    lower = low_atrium(np.random.default_rng(seed), planes, 6, 3)
+
+    np.testing.assert_array_equal(lower[[0, 1, 2, 6, 7, 8]], planes[[0, 1, 2, 6, 7, 8]])
+    left = np.isin(planes, (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM, Tissue.LEFT_ATRIUM))
+    np.testing.assert_array_equal(lower[left], planes[left])
+    areas = [np.count_nonzero(plane == Tissue.RIGHT_ATRIUM) for plane in lower[3:7]]
+    assert areas[0] > 0
+    assert (np.diff(areas[:3]) > 0).all()
+    for plane in lower[3:6]:
+        atrium, ventricle = (plane == one for one in (Tissue.RIGHT_ATRIUM, Tissue.RV_CAVITY))
+        # A leaflet of one pixel may cut a corner off.
+        leaflet = plane == Tissue.LEAFLET
+        assert ndimage.label(ventricle | leaflet, np.ones((3, 3)))[1] == 1
+        gone = (planes[5] == Tissue.RV_CAVITY) & ~ventricle
+        assert set(np.unique(plane[gone])) <= {Tissue.RIGHT_ATRIUM, Tissue.LEAFLET}
+    # Seen from the outflow, at the upper right, the atrium lies behind.
+    behind = ROWS - COLUMNS / 4
+    assert behind[atrium].mean() > behind[ventricle].mean() + 8
+    assert behind[atrium].max() > behind[ventricle].max()
+
+
+def test_an_atrium_comes_down_where_both_ventricles_lie_below_it():
+    planes = valve_planes()
+    assert lowest_atrium(planes[6:]) is None
+    assert lowest_atrium(planes[:6]) is None
+    for tissue in (Tissue.LV_CAVITY, Tissue.RV_CAVITY):
+        lacking = planes.copy()
+        lacking[5][lacking[5] == tissue] = Tissue.FAT
+        assert lowest_atrium(lacking) is None
+    small = planes.copy()
+    small[6:][(small[6:] == Tissue.RIGHT_ATRIUM) & (COLUMNS > 5)] = Tissue.FAT
+    assert lowest_atrium(small) is None
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("height", [1.5, 4.0, 7.5])
+def test_another_tip_ends_where_it_was_asked_to_with_muscle_around_the_cavity(seed, height):
+    planes = np.stack([short_axis()] * 10)
+    assert first_ventricle(planes) == 0
+    drawn = other_tip(np.random.default_rng(seed), planes, 8, height)
+
+    np.testing.assert_array_equal(drawn[8:], planes[8:])
+    whole = np.isin(drawn, (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM))
+    inside = drawn == Tissue.LV_CAVITY
+    areas = whole.sum(axis=(1, 2))
+    # A tip's last plane may be thinner than half a pixel.
+    assert areas[int(8 - np.ceil(height)) + 2 :].all()
+    assert not areas[: 8 - int(np.ceil(height)) + 1].any()
+    # Masks are moved by whole pixels: half a pixel all around is rounding.
+    assert (np.diff(areas[:9]) >= -np.pi * 18).all()
+    for plane, cavity in zip(whole, inside, strict=True):
+        np.testing.assert_array_equal(ndimage.binary_fill_holes(plane), plane)
+        assert not (cavity & ~ndimage.binary_erosion(plane)).any()
+    heart = np.isin(drawn, (Tissue.RV_CAVITY, Tissue.RV_WALL)).any(axis=(1, 2))
+    assert not heart[: int(np.ceil(8 - 0.8 * height))].any()
+    assert set(np.unique(drawn[0])) <= {Tissue.LUNG}
+
+
 def test_septum_has_no_wall_of_the_right_ventricle():
     plane = short_axis()
     stray = (AWAY >= 17.2) & (AWAY < 18) & (COLUMNS < 20) & (np.abs(ROWS - 32) < 8)
@@ -165,6 +239,25 @@ def test_jets_darken_blood_alone():
         assert image.min() > 0.15
         shown += image[blood].min() < 0.9
     assert 3 <= shown <= 20
+
+
+def test_no_vessel_is_drawn_where_another_slice_shows_the_heart():
+    """Bright ovals elsewhere, but none that could be the tip of a heart beyond the slice."""
+    plane = np.full((SIDE, SIDE), Tissue.LUNG, np.uint8)
+    beyond = AWAY < 18
+    seen = {True: 0, False: 0}
+    for seed in range(80):
+        decor = Decor(np.random.default_rng(seed), SIDE, rims=False, fat=False)
+        decor.organs = 0
+        decor.tubes = decor.tubes[:1]
+        for known in seen:
+            image = np.zeros((SIDE, SIDE), np.float32)
+            decor.paint(image, plane, USUAL_CONTRAST, beyond if known else None)
+            drawn = image > 0
+            seen[known] += drawn.any()
+            if known and drawn.any():
+                assert (drawn & beyond).sum() <= 0.3 * drawn.sum()
+    assert 0.3 * seen[False] < seen[True] < 0.95 * seen[False]
 
 
 def test_septum_without_trabeculae_still_has_them_on_the_free_wall():

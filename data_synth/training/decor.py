@@ -18,6 +18,10 @@ Label = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 
+MOST_IN_HEART = 0.3
+"""Share of a vessel's or bowel's oval that may lie where another slice shows the heart."""
+
+
 class Decor:
     """Detail that the tissue block lacks, the same through the three slices of an image.
 
@@ -53,8 +57,18 @@ class Decor:
             self.jets = self.jets[:0]
         self.septum_bare = fine and rng.random() < 0.5
 
-    def paint(self, image: Float32, tissue: Label, contrast: Contrast) -> None:
-        """Add the detail to one slice in place; ``tissue`` is that of its middle plane."""
+    def paint(
+        self, image: Float32, tissue: Label, contrast: Contrast, heart: Mask | None = None
+    ) -> None:
+        """Add the detail to one slice in place.
+
+        Parameters
+        ----------
+        tissue
+            That of the slice's middle plane.
+        heart
+            Where any of the image's slices shows the heart; by default where this one does.
+        """
         inside = IN_HEART[tissue]
         outside = ~inside & (tissue != Tissue.AIR)
         for number in range(self.organs):
@@ -68,7 +82,7 @@ class Decor:
             around = (away >= reach_px, away < reach_px + self.rim_px[0])
             self._darken(image, outside & around[0] & around[1], self.rims[0])
             self._darken(image, outside & (away < self.rim_px[1]), self.rims[1])
-        self._add_tubes(image, outside, contrast)
+        self._add_tubes(image, outside, contrast, inside if heart is None else heart)
         blood = IS_BLOOD[tissue]
         image[blood] *= (1 + self.flow * self.coarse[1])[blood]
         _darken_jets(image, blood, self.jets)
@@ -88,17 +102,26 @@ class Decor:
         if grey > 0:
             image[where] = np.minimum(image[where], grey)
 
-    def _add_tubes(self, image: Float32, outside: Mask, contrast: Contrast) -> None:
-        """Bright ovals with a dark rim: vessels and bowels that belong to no structure."""
+    def _add_tubes(self, image: Float32, outside: Mask, contrast: Contrast, heart: Mask) -> None:
+        """Bright ovals with a dark rim: vessels and bowels that belong to no structure.
+
+        One that would lie where another slice shows the heart is left out of this one: it would
+        look just as the heart's tip does.
+        """
         side = image.shape[0]
         for row, column, size, shape, grey in self.tubes:
             centre = (column * side, row * side)
             axes = ((2 + 12 * size) * 2, (2 + 12 * size) * (0.8 + shape))
-            for grown, value in ((3.0, contrast.muscle * 0.8), (0.0, 0.5 + 0.7 * grey)):
+            drawn = []
+            for grown in (3.0, 0.0):
                 oval = np.zeros(image.shape, np.uint8)
                 box = (centre, (axes[0] + grown, axes[1] + grown), 180 * grey)
                 cv2.ellipse(oval, box, 1, cv2.FILLED)
-                image[(oval > 0) & outside] = value
+                drawn.append((oval > 0) & outside)
+            if np.count_nonzero(drawn[0] & heart) > MOST_IN_HEART * np.count_nonzero(drawn[0]):
+                continue
+            image[drawn[0]] = contrast.muscle * 0.8
+            image[drawn[1]] = 0.5 + 0.7 * grey
 
 
 @dataclass(frozen=True, slots=True)

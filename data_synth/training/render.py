@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from data_synth.tissue import Tissue
 from data_synth.training.contrast import (
+    IN_HEART,
     LABEL_OF,
     USUAL_CONTRAST,
     Contrast,
@@ -21,6 +22,7 @@ from data_synth.training.contrast import (
 )
 from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
+from data_synth.training.ends import first_ventricle, low_atrium, lowest_atrium, other_tip
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
 from data_synth.training.walls import (
     laid_bare,
@@ -83,6 +85,10 @@ class Parts:
     """Left ventricles whose walls keep their thickness up to the valves, where they stand beside
     the right atrium; and walls thicker still."""
 
+    ends: bool = True
+    """Tips of any bluntness, with no vessel that looks like one below them, and right atria that
+    come down beside the left ventricle."""
+
 
 ALL_PARTS = Parts()
 
@@ -144,8 +150,11 @@ def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[
     middle, end = _draw_plane(rng, block)
     if parts.rims and rng.random() < 0.25:
         middle, end = _draw_grazing_plane(rng, block), 0
+    chance = rng.random() if parts.ends else 1.0
     ring = last_ring(block) if parts.base and rng.random() < 0.3 else None
-    if ring is not None and REACH <= ring < len(block) - REACH - 5:
+    if chance < 0.4:
+        block, middle, end = _draw_ends(rng, block, middle, end, atrium=chance < 0.2)
+    elif ring is not None and REACH <= ring < len(block) - REACH - 5:
         farther = int(rng.integers(1, 6))
         block = long_walled(block, ring, farther)
         middle, end = ring + int(rng.integers(-1, farther + 3)), 0
@@ -158,6 +167,25 @@ def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[
     if parts.fine and rng.random() < 0.45:
         planes = thick_walled(rng, planes, rng.choice([5.5, 9.0]) if parts.base else 4.0)
     return planes, end
+
+
+def _draw_ends(
+    rng: np.random.Generator, block: Label, middle: int, end: int, atrium: bool
+) -> tuple[Label, int, int]:
+    """The block with another tip or right atrium, and a plane near it, if the block shows them."""
+    if atrium:
+        lowest = lowest_atrium(block)
+        if lowest is not None and REACH < lowest < len(block) - REACH:
+            farther = int(rng.integers(1, 7))
+            drawn = low_atrium(rng, block, lowest, farther)
+            return drawn, lowest + int(rng.integers(-farther - 1, 3)), 0
+    else:
+        first = first_ventricle(block)
+        if first is not None and first >= 2:
+            last, height = first + int(rng.integers(0, 6)), rng.uniform(1.0, 8.0)
+            drawn = other_tip(rng, block, last, height)
+            return drawn, round(last - height) + int(rng.integers(-1, 5)), 0
+    return block, middle, end
 
 
 def _draw_plane(rng: np.random.Generator, block: Label) -> tuple[int, int]:
@@ -277,8 +305,9 @@ def _thick_slices(
     if covers is not None:
         mean[Tissue.PERICARDIUM] = covers.sac
     images = np.empty((3, side, side), np.float32)
-    for channel in range(3):
-        middle = REACH + NEIGHBOUR * (channel - 1)
+    middles = [REACH - NEIGHBOUR, REACH, REACH + NEIGHBOUR]
+    heart = np.asarray(IN_HEART[planes[middles]].any(axis=0)) if parts.ends else None
+    for channel, middle in enumerate(middles):
         near = planes[middle - 2 : middle + 3]
         grey = mean[near]
         if covers is not None:
@@ -288,7 +317,7 @@ def _thick_slices(
         images[channel] = np.abs(cv2.GaussianBlur(signed, (0, 0), border_px))
         images[channel] += contrast.texture[near[2]] * grain
         if decor is not None:
-            decor.paint(images[channel], near[2], contrast)
+            decor.paint(images[channel], near[2], contrast, heart)
     return np.maximum(images, 0)
 
 
