@@ -10,7 +10,7 @@ from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
 from data_synth.training.ends import first_ventricle, low_atrium, lowest_atrium, other_tip
 from data_synth.training.faults import windowed
-from data_synth.training.render import _other_sizes
+from data_synth.training.render import REACH, _draw_ends, _other_sizes
 from data_synth.training.walls import last_ring, long_walled, thick_walled, whole_septum
 
 SIDE = 64
@@ -192,6 +192,35 @@ def test_another_tip_ends_where_it_was_asked_to_with_muscle_around_the_cavity(se
     heart = np.isin(drawn, (Tissue.RV_CAVITY, Tissue.RV_WALL)).any(axis=(1, 2))
     assert not heart[: int(np.ceil(8 - 0.8 * height))].any()
     assert set(np.unique(drawn[0])) <= {Tissue.LUNG}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_other_ends_are_shown_where_they_are(seed):
+    below, above = valve_planes()[0], valve_planes()[-1]
+    lung = np.full((SIDE, SIDE), Tissue.LUNG, np.uint8)
+    block = np.stack([lung] * 10 + [below] * 20 + [above] * 18)
+    rng = np.random.default_rng(seed)
+
+    drawn, middle, end = _draw_ends(rng, block, 40, 1, atrium=True)
+    shown = (drawn == Tissue.RIGHT_ATRIUM).any(axis=(1, 2))
+    # It comes down by six planes at most, and the image lies about where it does.
+    assert 30 - 6 <= shown.argmax() < 30
+    assert shown.argmax() - 1 <= middle <= 32
+    assert end == 0
+
+    drawn, middle, end = _draw_ends(rng, block, 40, 1, atrium=False)
+    tip = np.isin(drawn, (Tissue.LV_CAVITY, Tissue.LV_MYOCARDIUM)).any(axis=(1, 2)).argmax()
+    assert 10 - 8 <= tip <= 10 + 5
+    assert tip - 3 <= middle <= tip + 5
+    assert end == 0
+
+
+def test_a_block_without_valves_or_tip_stays_as_it_is():
+    block = np.stack([short_axis()] * (4 * REACH))
+    for atrium in (True, False):
+        drawn, middle, end = _draw_ends(np.random.default_rng(1), block, 9, -1, atrium)
+        assert drawn is block
+        assert (middle, end) == (9, -1)
 
 
 def test_septum_has_no_wall_of_the_right_ventricle():
