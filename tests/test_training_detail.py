@@ -157,9 +157,24 @@ def test_a_low_right_atrium_takes_the_ventricle_from_behind_and_nothing_else(see
     assert behind[atrium].max() > behind[ventricle].max()
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_no_right_ventricle_is_left_behind_a_small_atrium(seed):
+    planes = valve_planes()
+    planes[planes == Tissue.RIGHT_ATRIUM] = Tissue.FAT
+    # Aside, so that it does not cut off what lies behind it.
+    planes[6:, np.hypot(ROWS - 36, COLUMNS - 7) < 7.5] = Tissue.RIGHT_ATRIUM
+    # What lies farther back than the atrium's own middle by its own radius.
+    back = (ROWS > 44) & (planes[5] == Tissue.RV_CAVITY)
+    assert back.any()
+    lower = low_atrium(np.random.default_rng(seed), planes, 6, 3)
+    assert not (lower[5][back] == Tissue.RV_CAVITY).any()
+    np.testing.assert_array_equal(lower[2][back], Tissue.RV_CAVITY)
+
+
 def test_an_atrium_comes_down_where_both_ventricles_lie_below_it():
     planes = valve_planes()
     assert lowest_atrium(planes[6:]) is None
+    assert lowest_atrium(np.concatenate([planes[6:], planes[:1]])) is None
     assert lowest_atrium(planes[:6]) is None
     for tissue in (Tissue.LV_CAVITY, Tissue.RV_CAVITY):
         lacking = planes.copy()
@@ -190,7 +205,9 @@ def test_another_tip_ends_where_it_was_asked_to_with_muscle_around_the_cavity(se
         np.testing.assert_array_equal(ndimage.binary_fill_holes(plane), plane)
         assert not (cavity & ~ndimage.binary_erosion(plane)).any()
     heart = np.isin(drawn, (Tissue.RV_CAVITY, Tissue.RV_WALL)).any(axis=(1, 2))
-    assert not heart[: int(np.ceil(8 - 0.8 * height))].any()
+    ended = int(np.ceil(8 - 0.8 * height))
+    assert not heart[:ended].any()
+    assert heart[ended:].all()
     assert set(np.unique(drawn[0])) <= {Tissue.LUNG}
 
 
