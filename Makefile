@@ -61,26 +61,27 @@ bench: setup ## speed beside peers, as ratios in one run
 train: setup ## make the segmentation weights anew from the phantom (five and a half hours; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
 	$(BIN)/python -m data_synth.training --out training --without rims --without bare --without fine \
-		--without base --without ends
+		--without base --without ends --without ill
 	$(BIN)/python -m data_synth.training --out training/second --pool training/pool --without fine \
-		--without base --without ends --start training/heart.pt --learning-rate 1e-3 --steps 8000
+		--without base --without ends --without ill --start training/heart.pt \
+		--learning-rate 1e-3 --steps 8000
 	$(BIN)/python -m data_synth.training --out training/third --pool training/pool --without fine \
-		--without base --without ends --seed 1 --hearts 80 --start training/second/heart.pt \
-		--learning-rate 1e-3 --steps 5000
+		--without base --without ends --without ill --seed 1 --hearts 80 \
+		--start training/second/heart.pt --learning-rate 1e-3 --steps 5000
 	$(BIN)/python -m data_synth.training --out training/fourth --pool training/pool --without base \
-		--without ends --seed 2 --hearts 0 --more 0 240 --more 1 80 \
+		--without ends --without ill --seed 2 --hearts 0 --more 0 240 --more 1 80 \
 		--start training/third/heart.pt --learning-rate 1e-3 --steps 6000
 	$(BIN)/python -m data_synth.training --out training/fifth --pool training/pool --seed 5 \
-		--hearts 140 --without ends --start training/fourth/heart.pt --learning-rate 7e-4 \
-		--steps 5500 --halfway
+		--hearts 140 --without ends --without ill --start training/fourth/heart.pt \
+		--learning-rate 7e-4 --steps 5500 --halfway
 	$(BIN)/python -m data_synth.training --out training/sixth --pool training/pool --seed 6 \
-		--hearts 0 --more 5 140 --without ends --start training/fifth/heart.pt \
+		--hearts 0 --more 5 140 --without ends --without ill --start training/fifth/heart.pt \
 		--learning-rate 7e-4 --steps 4500 --halfway
 	$(BIN)/python -m data_synth.training --out training/seventh --pool training/pool --seed 7 \
-		--hearts 120 --more 5 140 --start training/sixth/heart.pt --learning-rate 7e-4 \
-		--steps 7000 --halfway
+		--hearts 120 --more 5 140 --without ill --start training/sixth/heart.pt \
+		--learning-rate 7e-4 --steps 7000 --halfway
 	$(BIN)/python -m data_synth.training --out training/eighth --pool training/pool --seed 8 \
-		--hearts 0 --more 7 120 --more 5 140 --start training/seventh/heart.pt \
+		--hearts 0 --more 7 120 --more 5 140 --without ill --start training/seventh/heart.pt \
 		--learning-rate 7e-4 --steps 6000 --halfway
 	cp training/eighth/heart.onnx pipeline/imaging/weights/heart.onnx
 

@@ -1,10 +1,11 @@
 """What the segmenter does with images unlike those it was trained on: tables of Dice.
 
-    python benchmarks/segmentation_robustness.py [OUT] [--seeds 3] [--first 1] [--phases 2]
+    python benchmarks/segmentation_robustness.py [OUT] [--seeds 3] [--first 1] [--phases 2] ...
 
 Two renderers, side by side: the phantom's own (`data_synth.mr`) and one that shares nothing with
-it (`tests.outside_heart`). First both as they are, then both under the same faults, then images
-that show no heart. With OUT, every figure goes into OUT/robustness.json as well.
+it (`tests.outside_heart`). First images that show no heart, then both as they are and under the
+same faults, then hearts of the second one at their worst. With OUT, every figure goes into
+OUT/robustness.json as well.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
-from tests.outside_anatomy import Kind
+from tests.outside_anatomy import ILLNESSES, Kind
 from tests.outside_heart import Outside, Scan, moved, render, without_heart
 
 SNR = 30.0
@@ -47,6 +48,9 @@ class Outcome:
     """Of each structure in each phase that shows it; empty if the study was refused."""
     lowest_confidence: float
     refused: str = ""
+    ejection_off: tuple[float, float] = (float("nan"), float("nan"))
+    """Points by which the left and the right ventricle's ejection fractions are too large, as the
+    slices that are there show them."""
 
 
 def phantom(seed: int, phases: int, slices: int | None = None) -> Outside:
@@ -60,10 +64,10 @@ def phantom(seed: int, phases: int, slices: int | None = None) -> Outside:
     return Outside(cine, found.labels)
 
 
-def outside(seed: int, phases: int, slices: int | None = None) -> Outside:
+def outside(seed: int, phases: int, slices: int | None = None, illness: str = "") -> Outside:
     """A heart that shares nothing with the phantom; phase 1 of 3 is near end-systole."""
     times = (0.0, 0.35) if phases == 2 else tuple((np.arange(phases) / phases).tolist())
-    return render(seed, Scan(times, slices, snr=SNR))
+    return render(seed, Scan(times, slices, snr=SNR), illness=illness)
 
 
 def inverted(study: Outside) -> Outside:
@@ -169,7 +173,20 @@ def judge(study: Outside) -> Outcome:
         found = segment_cine(study.cine, SegmentSettings())
     except BeatfieldError as error:
         return Outcome({}, float("nan"), str(error))
-    return Outcome(overlap(found.labels, study.labels), float(np.nanmin(found.confidence)))
+    off = [ejection(found.labels, name) - ejection(study.labels, name)
+           for name in ("lv_cavity", "rv_cavity")]  # fmt: skip
+    return Outcome(
+        overlap(found.labels, study.labels),
+        float(np.nanmin(found.confidence)),
+        "",
+        (off[0], off[1]),
+    )
+
+
+def ejection(labels: Kind, name: str) -> float:
+    """Percent that the emptiest phase has less than the fullest, by pixels; NaN without any."""
+    pixels = (labels == LABELS[name]).sum(axis=(1, 2, 3))
+    return float(100 * (1 - pixels.min() / pixels.max())) if pixels.any() else float("nan")
 
 
 def overlap(found: Kind, truth: Kind) -> dict[str, list[float]]:
@@ -196,11 +213,13 @@ def cell(outcomes: list[Outcome], name: str) -> str:
 
 
 def print_row(title: str, outcomes: list[Outcome]) -> None:
-    """A row of a table: what was refused, lowest confidence, Dice of each structure."""
+    """A row: what was refused, lowest confidence, how far off volumes' changes are, and Dice."""
     refused = [outcome for outcome in outcomes if outcome.refused]
     sure = [outcome.lowest_confidence for outcome in outcomes if not outcome.refused]
     lowest = f"{min(sure):.2f}" if sure else "-"
-    cells = " | ".join(cell(outcomes, name) for name in LABELS)
+    off = np.abs([outcome.ejection_off for outcome in outcomes if not outcome.refused])
+    ejected = "{:.1f} / {:.1f}".format(*np.nanmean(off, axis=0)) if len(off) else "-"
+    cells = " | ".join([ejected, *(cell(outcomes, name) for name in LABELS)])
     print(f"| {title} | {len(refused)} of {len(outcomes)} | {lowest} | {cells} |", flush=True)
 
 
@@ -215,8 +234,9 @@ def print_refusals(rows: dict[str, list[Outcome]]) -> None:
 
 def print_head(title: str) -> None:
     """A table's title and first lines."""
-    print(f"\n{title}\n\n| | refused | lowest confidence | " + " | ".join(LABELS) + " |")
-    print("|---" * (3 + len(LABELS)) + "|")
+    columns = ["refused", "lowest confidence", "LV / RV ejection fraction off (points)", *LABELS]
+    print(f"\n{title}\n\n| | " + " | ".join(columns) + " |")
+    print("|---" * (1 + len(columns)) + "|")
 
 
 def variations(seeds: range, phases: int) -> dict[str, dict[str, list[Outcome]]]:
@@ -233,6 +253,17 @@ def variations(seeds: range, phases: int) -> dict[str, dict[str, list[Outcome]]]
         found[source]["60 phases, 4 slices"] = [judge(_many_phases(make, seeds[0]))]
         print_row("60 phases, 4 slices", found[source]["60 phases, 4 slices"])
         print_refusals(found[source])
+    return found
+
+
+def illnesses(seeds: range, phases: int) -> dict[str, list[Outcome]]:
+    """Hearts from outside at their worst; printed as they come."""
+    print_head(f"outside, ill: Dice mean / worst over {len(seeds)} seeds, {phases} phases each")
+    found = {}
+    for illness in ILLNESSES:
+        found[illness] = [judge(outside(seed, phases, illness=illness)) for seed in seeds]
+        print_row(illness, found[illness])
+    print_refusals(found)
     return found
 
 
@@ -284,10 +315,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--phases", type=int, default=2)
+    parser.add_argument("--ill", type=int, default=8, help="people with each illness")
     options = parser.parse_args()
     start = time.monotonic()
     said = no_heart()
     found = variations(range(options.first, options.first + options.seeds), options.phases)
+    found["ill"] = illnesses(range(options.first, options.first + options.ill), options.phases)
     print_loss(found)
     print(f"\n{time.monotonic() - start:.0f} s")
     if options.out:
@@ -303,7 +336,9 @@ def main() -> None:
 def as_json(outcome: Outcome) -> dict[str, object]:
     """An outcome as JSON takes it."""
     sure = None if outcome.refused else round(outcome.lowest_confidence, 4)
-    return {"dice": outcome.dice, "lowest_confidence": sure, "refused": outcome.refused}
+    off = [None if np.isnan(one) else round(one, 2) for one in outcome.ejection_off]
+    return {"dice": outcome.dice, "lowest_confidence": sure, "refused": outcome.refused,
+            "ejection_off": off}  # fmt: skip
 
 
 if __name__ == "__main__":

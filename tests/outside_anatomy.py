@@ -12,7 +12,7 @@ beyond; falls of the mitral and tricuspid planes, wall and vessel sizes are set 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -84,6 +84,44 @@ class Body:
     fine: Waves
     coarse: Waves
     branches: tuple[Waves, ...]
+    flat: float = 0.0
+    """Share by which the left ventricle's cavity reaches less far towards the right one: it and its
+    muscle lose up to a quarter of their volume, which `left_ventricle` does not know of."""
+    lopsided: float = 0.0
+    """How far (mm) the left cavity lies off the middle of its muscle, away from the septum."""
+
+
+ILLNESSES = ("overload", "thick", "wide")
+"""What `made_ill` knows: a right ventricle under load, whose wide cavity flattens the septum; a
+left one with a very thick septum, nearly shut at end-systole; a very wide left one, thin and weak.
+"""
+
+
+def made_ill(rng: np.random.Generator, body: Body, illness: str) -> Body:
+    """The same person with an illness at its worst, beyond what `draw_body` draws."""
+    spread = rng.uniform
+    if illness == "overload":
+        ill = replace(
+            body, lv_ed_ml=spread(75, 140), muscle_ml=spread(60, 95), flat=spread(0.3, 0.75),
+            rv_reach=spread(52, 78), rv_height=spread(1.3, 1.55), rv_apex=spread(0.92, 1.08),
+            rv_ef=spread(0.22, 0.45), tricuspid_fall=spread(8, 18),
+            atrium_right=(spread(26, 36), spread(32, 42), spread(42, 56)),
+        )  # fmt: skip
+    elif illness == "thick":
+        ill = replace(
+            body, lv_ed_ml=spread(80, 140), lv_ef=spread(0.68, 0.82), muscle_ml=spread(170, 270),
+            lopsided=spread(2.0, 6.0),
+        )  # fmt: skip
+    elif illness == "wide":
+        volume = spread(260, 400)
+        ill = replace(
+            body, lv_ed_ml=volume, lv_ef=spread(0.1, 0.3), muscle_ml=volume * spread(0.4, 0.55),
+            mitral_fall=spread(3, 8),
+        )  # fmt: skip
+    else:
+        raise ValueError(f"no illness {illness!r}")
+    # Wide ventricles are rounder than others.
+    return replace(ill, lv_length=86 * (ill.lv_ed_ml / 140) ** 0.27 * spread(0.93, 1.07))
 
 
 def draw_body(rng: np.random.Generator) -> Body:
@@ -224,7 +262,9 @@ def _root(body: Body, now: Moment) -> npt.NDArray[np.float64]:
     r = 0.42 * left_ventricle(body, 0.0).radius
     up = heart_axes(body) @ (0.0, 0.0, 1.0)
     bend = np.array([r + 3, r + 15, 36])
-    return np.stack([[r, r, now.base - 10], [r + 1, r + 5, now.base + 12], bend, bend + 45 * up])
+    return np.stack(
+        [[r - body.lopsided, r, now.base - 10], [r + 1, r + 5, now.base + 12], bend, bend + 45 * up]
+    )
 
 
 OPEN_TO: dict[Stuff, tuple[Stuff, ...]] = {
@@ -273,17 +313,18 @@ def _ventricle_layers(
 ) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     """Distances outside the epicardium and the cavity; where muscle stands inside the latter."""
 
-    def shell(radius: float, length: float) -> Array:
-        middle = (0.0, 0.0, now.base - TRUNCATED * length)
+    def shell(wall: float, length: float, aside: float = 0.0) -> Array:
+        radius = now.radius + wall
+        middle = (-aside, 0.0, now.base - TRUNCATED * length)
         half = (radius * body.squash, radius / body.squash, (1 - TRUNCATED) * length)
-        return np.maximum(ellipsoid(p, middle, half), -above)
+        return np.maximum(ellipsoid(_flattened(body, p, now, wall), middle, half), -above)
 
-    outer = shell(now.radius + now.wall, now.length + 0.6 * now.wall)
-    inner = shell(now.radius, now.length)
+    outer = shell(now.wall, now.length + 0.6 * now.wall)
+    inner = shell(0.0, now.length, body.lopsided)
     r, long = now.radius, now.length
     thick = 4.0 * (1 + 0.25 * now.shut)
     muscle = np.zeros(len(p), bool)
-    for x, y in ((-0.48, 0.45), (-0.2, -0.64)):
+    for x, y in ((-0.48 - body.lopsided / r, 0.45), (-0.2 - body.lopsided / r, -0.64)):
         foot = now.base - 0.78 * long
         way = [(0.75 * x * r, 0.75 * y * r, foot), (x * r, y * r, now.base - 0.38 * long)]
         muscle |= tube(p, way, (thick, 0.75 * thick)) < 0
@@ -292,6 +333,17 @@ def _ventricle_layers(
     some = np.flatnonzero(rim)
     muscle[some[body.fine.at(p[some]) > 1.5 - body.trabeculae]] = True
     return outer, inner, muscle
+
+
+def _flattened(body: Body, p: Array, now: Moment, wall: float) -> Array:
+    """Where points would lie if the septum were round: its wall keeps its thickness."""
+    if not body.flat:
+        return p
+    # Below the valves alone: the way out to the aorta stays open.
+    flat = body.flat * np.clip((now.base - 10 - p[:, 2]) / 15, 0, 1)
+    shrunk = (now.radius * (1 - flat) + wall) / (now.radius + wall)
+    round_x = np.where(p[:, 0] > 0, p[:, 0] / shrunk, p[:, 0])
+    return np.stack([round_x, p[:, 1], p[:, 2]], axis=1).astype(np.float32)
 
 
 def _atria(body: Body, p: Array, now: Moment, above: Array) -> list[tuple[Array, Stuff, float]]:

@@ -45,6 +45,7 @@ from tests.outside_anatomy import (
     heart_axes,
     heart_stuff,
     left_ventricle,
+    made_ill,
 )
 from tests.outside_chest import chest_stuff
 from tests.outside_shapes import Array, Waves
@@ -186,13 +187,17 @@ def steady_state(field_t: float, angle_deg: float, tr_ms: float, off_hz: Float) 
     return found
 
 
-def render(seed: int, scan: Scan, heart: bool = True) -> Outside:
+def render(seed: int, scan: Scan, heart: bool = True, illness: str = "") -> Outside:
     """The person that ``seed`` draws, scanned; without ``heart``, only what surrounds it.
+
+    ``illness``: one of `tests.outside_anatomy.ILLNESSES` that the same person has.
 
     The same seed gives the same person, plan and shifts whatever the scan's phases are.
     """
     rng = np.random.default_rng([seed, 77])
     body = draw_body(rng)
+    if illness:
+        body = made_ill(np.random.default_rng([seed, 78]), body, illness)
     frame, count, side = _plan(rng, body, scan)
     deviation_mm = scan.shift_sd_mm * np.array([0.1, 0.35, 0.93])
     shifts_mm = rng.standard_normal((count, 1)) * deviation_mm
@@ -264,7 +269,9 @@ def _slice_stuff(body: Body, points: Array, phases: tuple[float, ...]) -> Iterat
         yield still
     flat, axes = points.reshape(-1, 3), heart_axes(body).T.astype(np.float32)
     own = (flat - BASE_MM.astype(np.float32)) @ axes
-    near = np.flatnonzero((np.abs(own[:, 0] - 18) < 85) & (np.abs(own[:, 1]) < 80))
+    # Beyond what is drawn of healthy hearts, a wide right ventricle's reach is added.
+    wide_mm = 85 + max(0.0, 1.5 * (body.rv_reach - 50))
+    near = np.flatnonzero((np.abs(own[:, 0] - 18) < wide_mm) & (np.abs(own[:, 1]) < 80))
     own = (bent(body, flat[near]) - BASE_MM.astype(np.float32)) @ axes
     for phase in phases:
         stuff = still.copy()

@@ -12,7 +12,14 @@ from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
 from tests import outside_anatomy, outside_chest, outside_heart, outside_shapes
-from tests.outside_anatomy import Stuff, draw_body, heart_stuff, left_ventricle
+from tests.outside_anatomy import (
+    ILLNESSES,
+    Stuff,
+    draw_body,
+    heart_stuff,
+    left_ventricle,
+    made_ill,
+)
 from tests.outside_heart import Scan, render, steady_state, without_heart
 
 SEEDS = (1, 2, 3)
@@ -115,6 +122,54 @@ def test_drawn_volumes_are_those_of_the_body():
         assert wanted_ml * 0.99 < cavity_ml < wanted_ml + carved_ml
         assert whole_ml == pytest.approx(wanted_ml + body.muscle_ml, rel=0.01)
     assert left_ventricle(body, body.systole).wall > left_ventricle(body, 0.0).wall
+
+
+def along_x(body, phase=0.0):
+    """What lies on the way from the side wall to the right ventricle, at mid height, by 0.1 mm."""
+    x = np.arange(-60, 90, 0.1, dtype=np.float32)
+    middle_mm = left_ventricle(body, phase).base - 0.4 * body.lv_length
+    line = np.stack([x, np.full_like(x, 3.0), np.full_like(x, middle_mm)], axis=1)
+    return x, heart_stuff(body, line, phase)
+
+
+RIGHT = (Stuff.RV_BLOOD, Stuff.RV_TRABECULA)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_illnesses_are_as_they_say(seed):
+    rng = np.random.default_rng([seed, 5])
+    # Round, and without trabeculae, so that ends of the cavity tell its shape.
+    body = replace(draw_body(rng), squash=1.0, mitral_tilt=0.0, trabeculae=-9.0)
+    for illness in ILLNESSES:
+        ill = made_ill(rng, body, illness)
+        x, stuff = along_x(ill)
+        inside = x[np.isin(stuff, (Stuff.LV_BLOOD, Stuff.LV_PAPILLARY))]
+        muscle = x[stuff == Stuff.LV_MUSCLE]
+        side, septum = float(inside[0] - muscle[0]), float(muscle[-1] - inside[-1])
+        # Half a millimetre of each length: steps, and a tube of the outflow's that grazes it.
+        if illness == "overload":
+            assert inside[-1] == pytest.approx((1 - ill.flat) * -inside[0], abs=0.5)
+            assert septum == pytest.approx(side, abs=1.5)
+            usual = np.isin(along_x(body)[1], RIGHT).sum()
+            assert np.isin(stuff, RIGHT).sum() > 1.2 * usual
+        else:
+            assert septum - side == pytest.approx(2 * ill.lopsided, abs=0.5)
+            assert inside[-1] + inside[0] == pytest.approx(-2 * ill.lopsided, abs=0.5)
+        if illness == "thick":
+            # A wall of 15 mm is what the illness is known by.
+            assert septum > 15
+            emptied = left_ventricle(ill, ill.systole).radius / left_ventricle(ill, 0.0).radius
+            assert emptied < 0.65
+        if illness == "wide":
+            # Men's normal ones are up to 58 mm wide (Lang et al., J. Am. Soc. Echocardiogr.
+            # 28:1-39, 2015).
+            assert inside[-1] - inside[0] > 58
+
+
+def test_an_unknown_illness_is_refused():
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="no illness 'gout'"):
+        made_ill(rng, draw_body(rng), "gout")
 
 
 def test_noise_is_as_asked():

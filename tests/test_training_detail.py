@@ -10,7 +10,7 @@ from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
 from data_synth.training.ends import first_ventricle, low_atrium, lowest_atrium, other_tip
 from data_synth.training.faults import windowed
-from data_synth.training.render import REACH, _draw_ends, _other_sizes
+from data_synth.training.render import REACH, _draw_ends
 from data_synth.training.walls import last_ring, long_walled, thick_walled, whole_septum
 
 SIDE = 64
@@ -251,21 +251,6 @@ def test_septum_has_no_wall_of_the_right_ventricle():
     free = (plane == Tissue.RV_WALL) & (COLUMNS < 12)
     assert (found[free] == Tissue.RV_WALL).all()
     assert (found[plane != Tissue.RV_WALL] == plane[plane != Tissue.RV_WALL]).all()
-
-
-def test_other_structures_change_size_and_nothing_folds():
-    plane = short_axis(Tissue.FAT)
-    plane[np.hypot(ROWS - 10, COLUMNS - 50) < 6] = Tissue.AORTA
-    rows, columns = ROWS.astype(np.float32), COLUMNS.astype(np.float32)
-    sizes = []
-    for seed in range(80):
-        down, across = _other_sizes(np.random.default_rng(seed), plane, rows, columns)
-        area = np.diff(down, axis=0)[:, :-1] * np.diff(across, axis=1)[:-1]
-        area -= np.diff(down, axis=1)[:-1] * np.diff(across, axis=0)[:, :-1]
-        assert area.min() > 0
-        near = np.rint([down, across]).astype(int).clip(0, SIDE - 1)
-        sizes.append((plane[tuple(near)] == Tissue.AORTA).sum())
-    assert np.std(sizes) > 0.1 * np.mean(sizes)
 
 
 def test_jets_darken_blood_alone():

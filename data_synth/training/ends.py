@@ -1,4 +1,4 @@
-"""The same hearts with other ends: tips of any bluntness, right atria that come down lower."""
+"""The same hearts with other ends: tips of any bluntness, right chambers that reach lower."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ _RIGHT = (Tissue.RV_CAVITY, Tissue.RV_TRABECULA)
 _KEPT = (*_LEFT, Tissue.LEFT_ATRIUM, Tissue.AORTA)
 """What a right atrium cannot take the place of."""
 
+_CHEST = (Tissue.AIR, Tissue.MUSCLE, Tissue.BONE)
+"""What a right ventricle does not push aside."""
+
 _LEAST_AREA = 150
 """Pixels of a chamber that is well in the plane."""
 
 _BRUSH = np.ones((3, 3), np.uint8)
+_CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15))
 
 
 def lowest_atrium(planes: Label) -> int | None:
@@ -107,6 +111,61 @@ def first_ventricle(planes: Label) -> int | None:
     """
     area = np.count_nonzero(np.isin(planes, _INSIDE), axis=(1, 2))
     return int(np.argmax(area >= _LEAST_AREA)) if (area >= _LEAST_AREA).any() else None
+
+
+def far_right_ventricle(planes: Label, farther: int) -> Label:
+    """The same heart with its right ventricle reaching farther towards the apex, or past it.
+
+    What the right ventricle shows some planes above lies against the smaller left ventricle here,
+    in a wall of its own. Chest wall and what the heart has there already stay.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue, the apex first.
+    farther
+        Planes by which its tip reaches down; its widest cut stays where it is.
+    """
+    lower = planes.copy()
+    area = np.count_nonzero(np.isin(planes, _RIGHT), axis=(1, 2))
+    widest, tip = int(area.argmax()), int(np.argmax(area > 0))
+    for number in range(max(tip - farther, 0), widest):
+        # The nearer to the widest cut, the less it moves.
+        share = min(1.0, (widest - number) / max(widest - tip, 1))
+        above = min(number + round(farther * share), widest)
+        left, beside = np.isin(planes[above], _LEFT), np.isin(planes[above], _RIGHT)
+        if above > number and left.any() and np.count_nonzero(beside) >= _LEAST_AREA:
+            _put_right_ventricle(lower[number], planes[above])
+    return lower
+
+
+def _put_right_ventricle(plane: Label, above: Label) -> None:
+    """Draw the right ventricle of the plane ``above`` against the left one of this plane."""
+    left, left_above = (np.isin(one, _LEFT) for one in (plane, above))
+    right_above = np.isin(above, _RIGHT)
+    middle = _middle(left) if left.any() else _middle(left_above)
+    towards = _middle(right_above) - _middle(left_above)
+    towards /= max(float(np.linalg.norm(towards)), 1.0)
+    nearer = np.sqrt(left_above.sum() / np.pi) - np.sqrt(left.sum() / np.pi)
+    shift = middle - _middle(left_above) - nearer * towards
+    put = right_above | (above == Tissue.RV_WALL)
+    right = (_moved(put.astype(np.uint8), 1.0, shift) > 0) | np.isin(
+        plane, (*_RIGHT, Tissue.RV_WALL)
+    )
+    # A crescent bent about a larger circle leaves gaps beside a smaller one.
+    both = cv2.morphologyEx((right | left).astype(np.uint8), cv2.MORPH_CLOSE, _CLOSING) > 0
+    # The diaphragm, a sheet of muscle, gives way.
+    chest = np.isin(plane, _CHEST).astype(np.uint8)
+    chest = cv2.morphologyEx(chest, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
+    right = both & ~chest & ~np.isin(plane, (*_KEPT, Tissue.RIGHT_ATRIUM))
+    inside = right & (cv2.erode((right | left).astype(np.uint8), _BRUSH) > 0)
+    knots = _moved((above == Tissue.RV_TRABECULA).astype(np.uint8), 1.0, shift) > 0
+    plane[right] = Tissue.RV_WALL
+    plane[inside] = Tissue.RV_CAVITY
+    plane[inside & knots] = Tissue.RV_TRABECULA
+    beside = (cv2.dilate((right | left).astype(np.uint8), _BRUSH) > 0) & ~IN_HEART[plane]
+    beside &= ~chest
+    plane[beside] = Tissue.PERICARDIUM
 
 
 def other_tip(rng: np.random.Generator, planes: Label, last: int, height: float) -> Label:

@@ -22,8 +22,15 @@ from data_synth.training.contrast import (
 )
 from data_synth.training.coverings import Coverings
 from data_synth.training.decor import Decor
-from data_synth.training.ends import first_ventricle, low_atrium, lowest_atrium, other_tip
+from data_synth.training.ends import (
+    far_right_ventricle,
+    first_ventricle,
+    low_atrium,
+    lowest_atrium,
+    other_tip,
+)
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
+from data_synth.training.sizes import Places, ill_shape, other_sizes, swollen
 from data_synth.training.walls import (
     laid_bare,
     last_ring,
@@ -37,7 +44,6 @@ Float = npt.NDArray[np.floating]
 Float32 = npt.NDArray[np.float32]
 Label = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-Places = tuple[Float, Float]
 
 CROP = 128
 """Pixels along each side of a training image."""
@@ -89,16 +95,12 @@ class Parts:
     """Tips of any bluntness, with no vessel that looks like one below them, and right atria that
     come down beside the left ventricle."""
 
+    ill: bool = True
+    """Hearts at their worst: right ventricles so wide that they flatten the septum and reach past
+    the tip, left ones nearly shut within a thick wall, or wide and thin."""
+
 
 ALL_PARTS = Parts()
-
-_SIZES = {
-    Tissue.RV_CAVITY: 0.1,
-    Tissue.LEFT_ATRIUM: 0.15,
-    Tissue.RIGHT_ATRIUM: 0.15,
-    Tissue.AORTA: 0.22,
-}
-"""How widely the sizes of structures are drawn, apart from the left ventricle's cavity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +124,9 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     slices = _thick_slices(rng, planes, contrast, parts, fat=not bare or rng.random() < 0.3)
     rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
     if parts.fine and parts.shape:
-        rows, columns = _other_sizes(rng, planes[REACH], rows, columns)
+        rows, columns = other_sizes(rng, planes[REACH], rows, columns)
+    if parts.ill and parts.shape:
+        rows, columns = ill_shape(rng, planes[REACH], rows, columns)
     image = np.empty((3, CROP, CROP), np.float32)
     strays = parts.neighbours and rng.random() < 0.7
     strayed_px = rng.uniform(0.0, 2.2) if strays else 0.0
@@ -158,6 +162,13 @@ def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[
         farther = int(rng.integers(1, 6))
         block = long_walled(block, ring, farther)
         middle, end = ring + int(rng.integers(-1, farther + 3)), 0
+    if parts.ill and rng.random() < 0.12:
+        farther = int(rng.integers(1, 8))
+        block = far_right_ventricle(block, farther)
+        if rng.random() < 0.5:
+            first = first_ventricle(block)
+            middle = (middle if first is None else first) + int(rng.integers(-4, 8))
+            end = 0
     middle = int(np.clip(middle, REACH, len(block) - REACH - 1))
     planes = block[middle - REACH : middle + REACH + 1]
     if parts.fine:
@@ -243,41 +254,8 @@ def _draw_positions(rng: np.random.Generator, plane: Label, shape: bool) -> Plac
     columns = centre[1] + np.cos(turn) * across - np.sin(turn) * down
     rows = centre[0] + np.sin(turn) * across + np.cos(turn) * down
     if rng.random() < 0.6:
-        rows, columns = _swollen(rng, plane, rows, columns)
+        rows, columns = swollen(rng, plane, rows, columns)
     return rows.astype(np.float32), columns.astype(np.float32)
-
-
-def _other_sizes(rng: np.random.Generator, plane: Label, rows: Float, columns: Float) -> Places:
-    """Positions that make each other chamber and the aorta wider or narrower, some of the time."""
-    for tissue, sd in _SIZES.items():
-        if rng.random() < 0.35:
-            rows, columns = _swollen(rng, plane, rows, columns, tissue, sd)
-    return rows.astype(np.float32), columns.astype(np.float32)
-
-
-def _swollen(
-    rng: np.random.Generator,
-    plane: Label,
-    rows: Float,
-    columns: Float,
-    tissue: Tissue = Tissue.LV_CAVITY,
-    sd: float = 0.18,
-) -> Places:
-    """Positions that make a cavity wider or narrower than what surrounds it.
-
-    A radial scaling that fades out: r (1 + a exp(-(r / reach)^2)) rises everywhere while
-    -1 < a < 2.2, so nothing folds; ``sd`` is the deviation of a.
-    """
-    cavity = np.argwhere(plane[::2, ::2] == tissue) * 2.0
-    if not len(cavity):
-        return rows, columns
-    radius = np.sqrt(4 * len(cavity) / np.pi)
-    middle = cavity.mean(axis=0) + rng.normal(0.0, 0.15 * radius, 2)
-    away_rows, away_columns = rows - middle[0], columns - middle[1]
-    reach = max(radius, 4.0) * rng.uniform(0.7, 2.0)
-    square = (away_rows**2 + away_columns**2) / reach**2
-    factor = np.clip(rng.normal(0.0, sd), -0.35, 0.5) * np.exp(-square)
-    return rows + factor * away_rows, columns + factor * away_columns
 
 
 def _thick_slices(
