@@ -58,7 +58,7 @@ types: setup ## static types
 bench: setup ## speed beside peers, as ratios in one run
 	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
 
-train: setup ## make the segmentation weights anew from the phantom (five and a half hours; needs PyTorch)
+train: setup ## make the segmentation weights anew from the phantom (six and a half hours; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
 	$(BIN)/python -m data_synth.training --out training --without rims --without bare --without fine \
 		--without base --without ends --without ill
@@ -73,17 +73,23 @@ train: setup ## make the segmentation weights anew from the phantom (five and a 
 		--start training/third/heart.pt --learning-rate 1e-3 --steps 6000
 	$(BIN)/python -m data_synth.training --out training/fifth --pool training/pool --seed 5 \
 		--hearts 140 --without ends --without ill --start training/fourth/heart.pt \
-		--learning-rate 7e-4 --steps 5500 --halfway
+		--learning-rate 7e-4 --steps 5500 --halfway-from training/fourth/heart.pt
 	$(BIN)/python -m data_synth.training --out training/sixth --pool training/pool --seed 6 \
 		--hearts 0 --more 5 140 --without ends --without ill --start training/fifth/heart.pt \
-		--learning-rate 7e-4 --steps 4500 --halfway
+		--learning-rate 7e-4 --steps 4500 --halfway-from training/fifth/heart.pt
 	$(BIN)/python -m data_synth.training --out training/seventh --pool training/pool --seed 7 \
 		--hearts 120 --more 5 140 --without ill --start training/sixth/heart.pt \
-		--learning-rate 7e-4 --steps 7000 --halfway
+		--learning-rate 7e-4 --steps 7000 --halfway-from training/sixth/heart.pt
 	$(BIN)/python -m data_synth.training --out training/eighth --pool training/pool --seed 8 \
 		--hearts 0 --more 7 120 --more 5 140 --without ill --start training/seventh/heart.pt \
-		--learning-rate 7e-4 --steps 6000 --halfway
-	cp training/eighth/heart.onnx pipeline/imaging/weights/heart.onnx
+		--learning-rate 7e-4 --steps 6000 --halfway-from training/seventh/heart.pt
+	$(BIN)/python -m data_synth.training --out training/ninth --pool training/pool --seed 9 \
+		--hearts 0 --more 7 120 --more 5 140 --start training/eighth/heart.pt \
+		--learning-rate 7e-4 --steps 7000
+	$(BIN)/python -m data_synth.training --out training/tenth --pool training/pool --seed 10 \
+		--hearts 0 --more 7 120 --more 5 140 --start training/ninth/heart.pt \
+		--learning-rate 7e-4 --steps 5500 --halfway-from training/eighth/heart.pt
+	cp training/tenth/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
 	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)

@@ -282,7 +282,9 @@ def test_training_ends_half_way_where_asked(blocks, tmp_path):
     begun = torch.load(tmp_path / "heart.pt", weights_only=True)
     far = TrainSettings(steps=2, batch=2, start=tmp_path / "heart.pt")
     reached = train(list(blocks), far, tmp_path / "far").state_dict()
-    found = train(list(blocks), replace(far, halfway=True), tmp_path / "half").state_dict()
+    found = train(
+        list(blocks), replace(far, halfway_from=tmp_path / "heart.pt"), tmp_path / "half"
+    ).state_dict()
     name = "head.weight"
     assert (reached[name] - begun[name]).abs().max() > 1e-5
     torch.testing.assert_close(found[name], (begun[name] + reached[name]) / 2, rtol=0, atol=1e-8)
@@ -290,9 +292,9 @@ def test_training_ends_half_way_where_asked(blocks, tmp_path):
 
 def test_half_way_from_nowhere_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as refused:
-        main(["--out", str(tmp_path / "new"), "--halfway"])
+        main(["--out", str(tmp_path / "new"), "--halfway-from", str(tmp_path / "none.pt")])
     assert refused.value.code == 2
-    assert "--halfway needs --start" in capsys.readouterr().err
+    assert f"--halfway-from: no checkpoint at {tmp_path / 'none.pt'}" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from data_synth.tissue import Tissue
-from data_synth.training.ends import far_right_ventricle
+from data_synth.training.ends import far_right_ventricle, first_ventricle, shut_tip
 from data_synth.training.render import ALL_PARTS, draw_sample
 from data_synth.training.sizes import flat_septum, ill_shape, other_sizes, swollen
 
@@ -62,8 +62,9 @@ def test_a_cavity_changes_as_asked_and_nothing_folds(seed, factor):
     # About the middle everything is seen 1 + a times as small.
     steps = np.diff(places[0], axis=0)[MIDDLE - 1 : MIDDLE + 1, MIDDLE]
     assert steps.mean() == pytest.approx(1 + factor, rel=0.1)
-    size = (seen(plane, *places) == Tissue.LV_CAVITY).sum() / (np.pi * INNER**2)
-    assert (size > 1) == (factor < 0) or abs(factor) < 0.05
+    size = [(one == Tissue.LV_CAVITY).sum() for one in (seen(plane, *places), plane)]
+    # A small change moves no pixel's middle across the border.
+    assert (size[0] > size[1]) == (factor < 0) or abs(factor) < 0.1
 
 
 @given(st.floats(0.05, 0.95), st.floats(-np.pi, np.pi), st.booleans())
@@ -192,24 +193,55 @@ def test_a_far_right_ventricle_lies_against_the_left_one_in_a_wall_of_its_own(fa
             assert (ndimage.binary_fill_holes(whole) == whole).all()
 
 
+@pytest.mark.parametrize(("closed", "over"), [(6, 0), (9, 4), (14, 7)])
+def test_a_shut_tip_is_solid_and_opens_over_the_planes_asked_for(closed, over):
+    planes = tapering()
+    shut = shut_tip(planes, closed, over)
+    was, cavity = (one == Tissue.LV_CAVITY for one in (planes, shut))
+    np.testing.assert_array_equal(
+        shut[planes != Tissue.LV_CAVITY], planes[planes != Tissue.LV_CAVITY]
+    )
+    assert (shut[was & ~cavity] == Tissue.LV_MYOCARDIUM).all()
+    assert not cavity[:closed].any()
+    np.testing.assert_array_equal(cavity[closed + over :], was[closed + over :])
+    share = (
+        cavity.sum(axis=(1, 2))[closed : closed + over]
+        / was.sum(axis=(1, 2))[closed : closed + over]
+    )
+    assert (share < 1).all()
+    assert (np.diff(share) > 0).all()
+    # Linear in the radius: k / (over + 1) of it, and a rim of a pixel.
+    wanted = ((np.arange(over) + 1) / (over + 1)) ** 2
+    np.testing.assert_allclose(share, wanted, atol=0.15)
+
+
 @pytest.mark.parametrize("ill", [True, False])
 def test_hearts_at_their_worst_are_among_what_is_drawn_where_asked_for(monkeypatch, ill):
-    farther, shapes = [], []
+    asked, tips = {"far_right_ventricle": [], "shut_tip": [], "ill_shape": []}, []
 
-    def far(planes, by):
-        farther.append(by)
-        return planes
+    def noted(name):
+        def drawn(first, *others):
+            asked[name].append(others)
+            if name == "shut_tip":
+                tips.append(first)
+            return first if name != "ill_shape" else others[1:]
 
-    def shape(rng, plane, rows, columns):
-        shapes.append(plane)
-        return rows, columns
+        return drawn
 
-    monkeypatch.setattr("data_synth.training.render.far_right_ventricle", far)
-    monkeypatch.setattr("data_synth.training.render.ill_shape", shape)
+    for name in asked:
+        monkeypatch.setattr(f"data_synth.training.render.{name}", noted(name))
     block = np.concatenate([tapering()[:6], np.repeat(tapering()[6:], 2, axis=0)])
     for seed in range(200):
         draw_sample(np.random.default_rng(seed), block, replace(ALL_PARTS, ill=ill))
-    assert len(shapes) == 200 * ill
+    assert len(asked["ill_shape"]) == 200 * ill
     # Three deviations of 0.12 drawn 200 times are 0.07.
-    assert len(farther) / 200 == pytest.approx(0.12 * ill, abs=0.07 * ill)
-    assert not ill or 1 <= min(farther) < max(farther) <= 7
+    for name in ("far_right_ventricle", "shut_tip"):
+        assert len(asked[name]) / 200 == pytest.approx(0.12 * ill, abs=0.07 * ill)
+    if ill:
+        farther = [by for (by,) in asked["far_right_ventricle"]]
+        assert 1 <= min(farther) < max(farther) <= 7
+        closed, over = np.array(asked["shut_tip"]).T
+        # From the first plane that shows much of the cavity; tips may have been drawn anew before.
+        first = [first_ventricle(planes) for planes in tips]
+        assert 0 <= (closed - first).min() < (closed - first).max() <= 11
+        assert 0 <= over.min() < over.max() <= 7

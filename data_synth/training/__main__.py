@@ -19,8 +19,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Fill the pool, train, and leave `heart.onnx` in the folder given by `--out`."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    if options.halfway and not options.start:
-        parser.error("--halfway needs --start: it ends half-way from there")
+    if options.halfway_from and not options.halfway_from.is_file():
+        parser.error(f"--halfway-from: no checkpoint at {options.halfway_from}")
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
     folder = options.pool or options.out / "pool"
@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
         batch=options.batch,
         learning_rate=options.learning_rate,
         start=options.start,
-        halfway=options.halfway,
+        halfway_from=options.halfway_from,
         parts=Parts(**dict.fromkeys(options.without, False)),
         seed=options.seed,
         export_minutes=options.export_minutes,
@@ -69,8 +69,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
     parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
     parser.add_argument(
-        "--halfway", action="store_true",
-        help="end half-way between the weights of --start and those learned since",
+        "--halfway-from", type=Path, metavar="START",
+        help="heart.pt to end half-way from, between its weights and those learned",
     )  # fmt: skip
     parser.add_argument(
         "--without", action="append", default=[], choices=[part.name for part in fields(Parts)],

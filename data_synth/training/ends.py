@@ -209,6 +209,27 @@ def other_tip(rng: np.random.Generator, planes: Label, last: int, height: float)
     return drawn
 
 
+def shut_tip(planes: Label, closed: int, over: int) -> Label:
+    """The same heart with a left ventricle whose cavity is shut towards the tip: solid muscle.
+
+    Parameters
+    ----------
+    planes
+        ``(plane, row, column)`` tissue, the apex first.
+    closed
+        The first plane that shows a cavity.
+    over
+        Planes over which it widens to what it was.
+    """
+    shut = planes.copy()
+    for number in range(min(closed + over, len(planes))):
+        inside = np.isin(planes[number], _INSIDE)
+        depth_px = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
+        share = max(number - closed + 1, 0) / (over + 1)
+        shut[number][inside & (depth_px <= (1 - share) * depth_px.max())] = Tissue.LV_MYOCARDIUM
+    return shut
+
+
 def _clear(plane: Label, everything: bool) -> None:
     """Take the left ventricle, or the whole heart, out of a plane; what lies around fills in."""
     gone = (IN_HEART[plane] if everything else np.isin(plane, _LEFT)) | (

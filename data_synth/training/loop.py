@@ -39,9 +39,10 @@ class TrainSettings:
     start: Path | None = None
     """Checkpoint to go on from; by default weights are drawn at random."""
 
-    halfway: bool = False
-    """End half-way between the weights of ``start`` and those learned since: what is new is learned
-    and what was known kept (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+    halfway_from: Path | None = None
+    """Checkpoint to end half-way from, between its weights and those learned: what is new is
+    learned and what was known kept (Wortsman et al., "Robust fine-tuning of zero-shot models",
+    CVPR 2022).
     Running statistics are averaged like weights. What is exported on the way is not half-way."""
 
     parts: Parts = ALL_PARTS
@@ -118,8 +119,8 @@ def train(
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
             save(out, average.network)
-    if settings.halfway and settings.start is not None:
-        move_halfway(average.network, torch.load(settings.start, weights_only=True))
+    if settings.halfway_from is not None:
+        move_halfway(average.network, torch.load(settings.halfway_from, weights_only=True))
     save(out, average.network)
     return average.network
 

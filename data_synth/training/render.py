@@ -28,6 +28,7 @@ from data_synth.training.ends import (
     low_atrium,
     lowest_atrium,
     other_tip,
+    shut_tip,
 )
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
 from data_synth.training.sizes import Places, ill_shape, other_sizes, swollen
@@ -162,13 +163,8 @@ def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[
         farther = int(rng.integers(1, 6))
         block = long_walled(block, ring, farther)
         middle, end = ring + int(rng.integers(-1, farther + 3)), 0
-    if parts.ill and rng.random() < 0.12:
-        farther = int(rng.integers(1, 8))
-        block = far_right_ventricle(block, farther)
-        if rng.random() < 0.5:
-            first = first_ventricle(block)
-            middle = (middle if first is None else first) + int(rng.integers(-4, 8))
-            end = 0
+    if parts.ill:
+        block, middle, end = _draw_ill_ends(rng, block, middle, end)
     middle = int(np.clip(middle, REACH, len(block) - REACH - 1))
     planes = block[middle - REACH : middle + REACH + 1]
     if parts.fine:
@@ -197,6 +193,23 @@ def _draw_ends(
             drawn = other_tip(rng, block, last, height)
             return drawn, round(last - height) + int(rng.integers(-1, 5)), 0
     return block, middle, end
+
+
+def _draw_ill_ends(
+    rng: np.random.Generator, block: Label, middle: int, end: int
+) -> tuple[Label, int, int]:
+    """The block with a far right ventricle or a left one shut towards its tip, now and then."""
+    chance, first = rng.random(), first_ventricle(block)
+    if chance > 0.24 or first is None:
+        return block, middle, end
+    if chance < 0.12:
+        drawn, reach = far_right_ventricle(block, int(rng.integers(1, 8))), 8
+    else:
+        closed, over = first + int(rng.integers(0, 12)), int(rng.integers(0, 8))
+        drawn, reach = shut_tip(block, closed, over), closed + over - first + 2
+    if rng.random() < 0.6:
+        return drawn, first + int(rng.integers(-4, reach)), 0
+    return drawn, middle, end
 
 
 def _draw_plane(rng: np.random.Generator, block: Label) -> tuple[int, int]:
