@@ -315,12 +315,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--phases", type=int, default=2)
-    parser.add_argument("--ill", type=int, default=8, help="people with each illness")
+    parser.add_argument("--ill", type=int, default=8, help="people with each illness; 0: none")
     options = parser.parse_args()
     start = time.monotonic()
     said = no_heart()
     found = variations(range(options.first, options.first + options.seeds), options.phases)
-    found["ill"] = illnesses(range(options.first, options.first + options.ill), options.phases)
+    if options.ill:
+        found["ill"] = illnesses(range(options.first, options.first + options.ill), options.phases)
     print_loss(found)
     print(f"\n{time.monotonic() - start:.0f} s")
     if options.out:

@@ -193,7 +193,7 @@ def test_a_far_right_ventricle_lies_against_the_left_one_in_a_wall_of_its_own(fa
             assert (ndimage.binary_fill_holes(whole) == whole).all()
 
 
-@pytest.mark.parametrize(("closed", "over"), [(6, 0), (9, 4), (14, 7)])
+@pytest.mark.parametrize(("closed", "over"), [(9, 0), (9, 4), (14, 7)])
 def test_a_shut_tip_is_solid_and_opens_over_the_planes_asked_for(closed, over):
     planes = tapering()
     shut = shut_tip(planes, closed, over)

@@ -117,7 +117,8 @@ def far_right_ventricle(planes: Label, farther: int) -> Label:
     """The same heart with its right ventricle reaching farther towards the apex, or past it.
 
     What the right ventricle shows some planes above lies against the smaller left ventricle here,
-    in a wall of its own. Chest wall and what the heart has there already stay.
+    in a wall of its own. Left ventricle, atria and aorta stay, and all of the chest wall that is
+    no thin sheet.
 
     Parameters
     ----------

@@ -100,6 +100,8 @@ def train(
     network = HeartNet().to(memory_format=torch.channels_last)
     if settings.start is not None:
         network.load_state_dict(torch.load(settings.start, weights_only=True))
+    # Before anything is written: it may lie where this run's own checkpoints will.
+    others = torch.load(settings.halfway_from, weights_only=True) if settings.halfway_from else None
     average = Average(network)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3)
     started_s = time.monotonic()
@@ -119,8 +121,8 @@ def train(
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
             save(out, average.network)
-    if settings.halfway_from is not None:
-        move_halfway(average.network, torch.load(settings.halfway_from, weights_only=True))
+    if others is not None:
+        move_halfway(average.network, others)
     save(out, average.network)
     return average.network
 

@@ -115,7 +115,7 @@ def flat_septum(plane: Label, rows: Float, columns: Float, flatness: float) -> P
     if left.sum() < _LEAST_ROUND * np.pi * farthest**2:
         return rows, columns
     towards = np.argwhere(right).mean(axis=0) - middle
-    towards /= np.linalg.norm(towards)
+    towards /= max(float(np.linalg.norm(towards)), 1e-6)
     radius = np.sqrt(left.sum() / np.pi)
     wall = radius - np.sqrt(np.isin(plane, _LEFT[:2]).sum() / np.pi)
     reach = ((np.argwhere(right) - middle) @ towards).max()
