@@ -29,8 +29,9 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
-from tests.outside_anatomy import ILLNESSES, Kind
+from tests.outside_anatomy import Kind
 from tests.outside_heart import Outside, Scan, moved, render, without_heart
+from tests.outside_people import ILLNESSES
 
 SNR = 30.0
 """Of both renderers' images as they are."""

@@ -4,22 +4,19 @@ It shares nothing with the phantom of the project but the names of six structure
 patient's LPS (mm) for the chest; for the heart its own ``(x, y, z)`` in mm, from the middle of
 the mitral plane at end-diastole: x towards the right ventricle, y upwards in a short-axis image,
 z from the apex to the base.
-
-Sizes: left ventricle, right ventricle, muscle and their ejection fractions span what Petersen et
-al. found in health (J. Cardiovasc. Magn. Reson. 19:18, 2017; 95 % of people) and some illness
-beyond; falls of the mitral and tricuspid planes, wall and vessel sizes are set by eye.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 
-from tests.outside_shapes import REACH_MM, Array, Waves, both, ellipsoid, tube
+from tests.outside_people import Body, Scar
+from tests.outside_shapes import REACH_MM, Array, both, ellipsoid, tube
 
 Kind = npt.NDArray[np.uint8]
 
@@ -47,113 +44,6 @@ class Stuff(IntEnum):
     LEFT_ATRIUM = 17
     RIGHT_ATRIUM = 18
     AORTA = 19
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """Everything that is drawn of one person; lengths in mm, volumes in ml."""
-
-    lv_length: float
-    lv_ed_ml: float
-    lv_ef: float
-    muscle_ml: float
-    squash: float
-    mitral_fall: float
-    mitral_tilt: float
-    tricuspid_fall: float
-    rv_reach: float
-    rv_height: float
-    rv_ef: float
-    rv_apex: float
-    outflow: tuple[float, float, float]
-    root_radius: float
-    atrium_left: tuple[float, float, float]
-    atrium_right: tuple[float, float, float]
-    systole: float
-    apex_way: tuple[float, float, float]
-    roll_deg: float
-    fat_heart: float
-    fat_skin: float
-    half_width: float
-    half_depth: float
-    diaphragm: float
-    arms: bool
-    gas: float
-    trabeculae: float
-    bends: tuple[Waves, ...]
-    fine: Waves
-    coarse: Waves
-    branches: tuple[Waves, ...]
-    flat: float = 0.0
-    """Share by which the left ventricle's cavity reaches less far towards the right one. Of its
-    volume it loses up to 27 %, the muscle a sixth, which `left_ventricle` does not know of."""
-    lopsided: float = 0.0
-    """How far (mm) the left cavity lies off the middle of its muscle, away from the septum."""
-
-
-ILLNESSES = ("overload", "thick", "wide")
-"""What `made_ill` knows: a right ventricle under load, whose wide cavity flattens the septum; a
-left one with a very thick septum, nearly shut at end-systole; a very wide left one, thin and weak.
-"""
-
-
-def made_ill(rng: np.random.Generator, body: Body, illness: str) -> Body:
-    """The same person with an illness at its worst, beyond what `draw_body` draws."""
-    spread = rng.uniform
-    if illness == "overload":
-        ill = replace(
-            body, lv_ed_ml=spread(75, 140), muscle_ml=spread(60, 95), flat=spread(0.3, 0.75),
-            rv_reach=spread(52, 78), rv_height=spread(1.3, 1.55), rv_apex=spread(0.92, 1.08),
-            rv_ef=spread(0.22, 0.45), tricuspid_fall=spread(8, 18),
-            atrium_right=(spread(26, 36), spread(32, 42), spread(42, 56)),
-        )  # fmt: skip
-    elif illness == "thick":
-        ill = replace(
-            body, lv_ed_ml=spread(80, 140), lv_ef=spread(0.68, 0.82), muscle_ml=spread(170, 270),
-            lopsided=spread(2.0, 6.0),
-        )  # fmt: skip
-    elif illness == "wide":
-        volume = spread(260, 400)
-        ill = replace(
-            body, lv_ed_ml=volume, lv_ef=spread(0.1, 0.3), muscle_ml=volume * spread(0.4, 0.55),
-            mitral_fall=spread(3, 8),
-        )  # fmt: skip
-    else:
-        raise ValueError(f"no illness {illness!r}")
-    # Wide ventricles are rounder than others.
-    return replace(ill, lv_length=86 * (ill.lv_ed_ml / 140) ** 0.27 * spread(0.93, 1.07))
-
-
-def draw_body(rng: np.random.Generator) -> Body:
-    """One person, healthy two times in three, else with a large weak or a thick left ventricle."""
-    kind = rng.choice(4, p=[0.4, 0.27, 0.18, 0.15])
-    spread = rng.uniform
-    if kind == 2:
-        volume, fraction, muscle = spread(180, 260), spread(0.2, 0.45), spread(110, 160)
-    elif kind == 3:
-        volume, fraction, muscle = spread(90, 150), spread(0.55, 0.75), spread(140, 200)
-    else:
-        volume, fraction, muscle = spread(95, 190), spread(0.5, 0.69), 0.0
-        muscle = volume * spread(0.52, 0.75)
-    length = 86 * (volume / 140) ** (1 / 3) * spread(0.93, 1.07)
-    return Body(
-        lv_length=length, lv_ed_ml=volume, lv_ef=fraction, muscle_ml=muscle,
-        squash=spread(0.95, 1.06), mitral_fall=(4 + 16 * fraction) * spread(0.8, 1.2),
-        mitral_tilt=spread(-0.3, 0.02), tricuspid_fall=spread(14, 25),
-        rv_reach=spread(33, 50), rv_height=spread(1.15, 1.35), rv_ef=spread(0.42, 0.66),
-        rv_apex=spread(0.78, 0.95), outflow=(spread(-4, 8), spread(40, 50), spread(8, 18)),
-        root_radius=spread(12.5, 18),
-        atrium_left=(spread(23, 33), spread(19, 28), spread(38, 56)),
-        atrium_right=(spread(20, 28), spread(24, 34), spread(36, 50)),
-        systole=spread(0.3, 0.42),
-        apex_way=(spread(0.5, 0.75), spread(-0.68, -0.45), spread(-0.62, -0.3)),
-        roll_deg=spread(-14, 10), fat_heart=spread(1.5, 7), fat_skin=spread(6, 32),
-        half_width=spread(150, 180), half_depth=spread(104, 130), diaphragm=spread(-8, 6),
-        arms=bool(rng.random() < 0.4), gas=spread(0.1, 0.7), trabeculae=spread(0.1, 0.9),
-        bends=tuple(Waves.drawn(rng, 120) for _ in range(3)),
-        fine=Waves.drawn(rng, 11, 6), coarse=Waves.drawn(rng, 45, 4),
-        branches=tuple(Waves.drawn(rng, 38, 4) for _ in range(2)),
-    )  # fmt: skip
 
 
 def bent(body: Body, points_mm: Array, by_mm: float = 2.0) -> Array:
@@ -282,20 +172,26 @@ def heart_stuff(body: Body, p: Array, phase: float) -> Kind:
     now = left_ventricle(body, phase)
     stuff = np.zeros(len(p), np.uint8)
     # What is painted later covers what came before: chambers push their neighbours' walls aside.
-    outer = np.full(len(p), 1e3, np.float32)
     plane = now.base + np.float32(body.mitral_tilt) * p[:, 0]
     above = plane - p[:, 2]
     right, artery = _right_ventricle(body, p, now)
     layers = [*_veins(body, p), (artery, Stuff.BLOOD, 1.2)]
     layers += _atria(body, p, now, above)
     aorta = tube(p, _root(body, now), body.root_radius * np.array([0.85, 1.05, 0.95, 1.0]))
-    layers += [(np.maximum(aorta, above), Stuff.AORTA, 1.5), (right, Stuff.RV_BLOOD, 2.5)]
+    layers += [(np.maximum(aorta, above), Stuff.AORTA, 1.5), (right, Stuff.RV_BLOOD, body.rv_wall)]
     walls = _ventricle_layers(body, p, now, above)
-    _paint_fat(body, p, now, stuff, [gap for gap, _, _ in layers] + [walls[0]], outer)
+    # Fat lies on the right ventricle's wall, however thick that is.
+    gaps = {kind: gap for gap, kind, _ in layers if kind != Stuff.BLOOD}
+    gaps[Stuff.RV_BLOOD] = right - np.float32(body.rv_wall - 2.5)
+    gaps[Stuff.LV_MUSCLE] = walls[0]
+    vessels = [gap for gap, kind, _ in layers if kind == Stuff.BLOOD]
+    _paint_fat(body, p, now, stuff, gaps, vessels)
     for gap, kind, wall in layers:
         # Where chamber opens into chamber stands no wall, but a leaflet.
         open_to = np.isin(stuff, OPEN_TO.get(kind, ()))
-        stuff[gap < np.where(open_to, LEAFLET_MM, wall)] = Stuff.WALL
+        beside = np.isin(stuff, (Stuff.AORTA, Stuff.LEFT_ATRIUM))
+        thick = np.where(beside, min(wall, 2.5), wall)
+        stuff[gap < np.where(open_to, LEAFLET_MM, thick)] = Stuff.WALL
         stuff[gap < 0] = kind
     rim = np.flatnonzero((right < 0) & (right > -5))
     knotty = body.fine.at(p[rim]) + body.coarse.at(p[rim]) > 2.1 - body.trabeculae
@@ -321,6 +217,9 @@ def _ventricle_layers(
 
     outer = shell(now.wall, now.length + 0.6 * now.wall)
     inner = shell(0.0, now.length, body.lopsided)
+    if body.scar is not None:
+        outer, inner = _scarred(body, body.scar, p, now, outer, inner)
+        outer, inner = np.maximum(outer, -above), np.maximum(inner, -above)
     r, long = now.radius, now.length
     thick = 4.0 * (1 + 0.25 * now.shut)
     muscle = np.zeros(len(p), bool)
@@ -328,11 +227,33 @@ def _ventricle_layers(
         foot = now.base - 0.78 * long
         way = [(0.75 * x * r, 0.75 * y * r, foot), (x * r, y * r, now.base - 0.38 * long)]
         muscle |= tube(p, way, (thick, 0.75 * thick)) < 0
-    depth = 2.5 + 3.0 * body.trabeculae
+    depth = 2.5 + 3.0 * body.trabeculae + body.sponge
     rim = (inner > -depth) & (inner < 0) & (p[:, 2] < now.base - 0.3 * long)
     some = np.flatnonzero(rim)
-    muscle[some[body.fine.at(p[some]) > 1.5 - body.trabeculae]] = True
+    muscle[some[body.fine.at(p[some]) > 1.5 - body.trabeculae - 0.08 * body.sponge]] = True
     return outer, inner, muscle
+
+
+def _scarred(
+    body: Body, scar: Scar, p: Array, now: Moment, outer: Array, inner: Array
+) -> tuple[Array, Array]:
+    """Distances outside epicardium and cavity where an infarct has thinned the wall."""
+    middle = np.array([0.0, 0.0, now.base - 0.45 * now.length])
+    size = np.array([now.radius + now.wall] * 2 + [0.55 * now.length + now.wall])
+    place = middle + size * scar.way
+    away = np.linalg.norm(p - place.astype(np.float32), axis=1)
+    # At the valves the ring stays whole.
+    share = np.clip((scar.reach - away) / 12, 0, 1) * np.clip((now.base - 12 - p[:, 2]) / 10, 0, 1)
+    share = (share * share * (3 - 2 * share)).astype(np.float32)
+    # A millimetre counts for less towards the tip, as `ellipsoid` measures.
+    long, radius = now.length + 0.6 * now.wall, now.radius + now.wall
+    half = np.array([radius * body.squash, radius / body.squash, (1 - TRUNCATED) * long])
+    off = (p - np.array([0, 0, now.base - TRUNCATED * long])) / half
+    steep = half.min() * np.linalg.norm(off / half, axis=1) / np.linalg.norm(off, axis=1)
+    bulge_mm = scar.bulge * (0.3 + 0.7 * now.shut)
+    outer = np.asarray(outer - bulge_mm * steep * share, np.float32)
+    thin = (1 - share) * inner + share * (outer + scar.wall * steep)
+    return outer, np.minimum(inner, thin.astype(np.float32))
 
 
 def _flattened(body: Body, p: Array, now: Moment, wall: float) -> Array:
@@ -381,11 +302,10 @@ def _veins(body: Body, p: Array) -> list[tuple[Array, Stuff, float]]:
 
 
 def _paint_fat(
-    body: Body, p: Array, now: Moment, stuff: Kind, gaps: list[Array], outer: Array
+    body: Body, p: Array, now: Moment, stuff: Kind, gaps: dict[Stuff, Array], vessels: list[Array]
 ) -> None:
-    """Fat around heart and vessels, thickest in the groove above the ventricles."""
-    for gap in gaps:
-        np.minimum(outer, gap, out=outer)
+    """Fat around heart and vessels, thickest in the groove above the ventricles; and fluid."""
+    outer = np.minimum.reduce([*gaps.values(), *vessels])
     some = np.flatnonzero(outer < REACH_MM)
     q, gap = p[some], outer[some]
     groove = np.exp(-(((q[:, 2] - now.base) / 14) ** 2))
@@ -393,4 +313,12 @@ def _paint_fat(
     # The lung lies against the side wall; fat gathers towards the right ventricle.
     thick = np.maximum(thick * np.clip(0.6 + q[:, 0] / 40, 0.1, 1.3), 0.8)
     stuff[some[gap < thick + 1.0]] = Stuff.PERICARDIUM
+    if body.fluid:
+        # It gathers below and behind, and hardly above the ventricles; none about the vessels.
+        fluid = body.fluid * np.clip(0.7 - q[:, 1] / 80 + 0.3 * body.coarse.at(q), 0.1, 1.4)
+        fluid *= np.clip((now.base + 25 - q[:, 2]) / 20, 0, 1)
+        wet = np.minimum(thick + fluid, REACH_MM - 1.5)
+        chambers = np.minimum.reduce([one[some] for one in gaps.values()])
+        stuff[some[chambers < wet + 1.0]] = Stuff.PERICARDIUM
+        stuff[some[chambers < wet]] = Stuff.SPINAL_FLUID
     stuff[some[gap < thick]] = Stuff.FAT

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from tests.outside_anatomy import Body, Kind, Stuff
+from tests.outside_anatomy import Kind, Stuff
+from tests.outside_people import Body
 from tests.outside_shapes import Array, ellipsoid
 
 
@@ -29,6 +30,8 @@ def chest_stuff(body: Body, p: Array) -> Kind:
     vessel = branch[0] ** 2 + branch[1] ** 2 < 0.03
     stuff[inside] = np.where(vessel, Stuff.BLOOD, Stuff.LUNG)[inside]
     between = np.abs(x - 6 - 6 * uneven) < 5 + 29 / (1 + np.exp((10 - y) / 14))
+    if body.fluid:
+        stuff[inside & (y > half[1] * (0.75 - 0.04 * body.fluid) + 4 * uneven)] = Stuff.SPINAL_FLUID
     stuff[inside & between] = Stuff.FAT
     _paint_belly(body, p, inside, vessel, stuff)
     _paint_spine(body, p, stuff)

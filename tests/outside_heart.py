@@ -37,17 +37,15 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.labels import LABELS
 from tests.outside_anatomy import (
     BASE_MM,
-    Body,
     Kind,
     Stuff,
     bent,
-    draw_body,
     heart_axes,
     heart_stuff,
     left_ventricle,
-    made_ill,
 )
 from tests.outside_chest import chest_stuff
+from tests.outside_people import Body, draw_body, made_ill
 from tests.outside_shapes import Array, Waves
 
 Float = npt.NDArray[np.float64]
@@ -190,7 +188,7 @@ def steady_state(field_t: float, angle_deg: float, tr_ms: float, off_hz: Float) 
 def render(seed: int, scan: Scan, heart: bool = True, illness: str = "") -> Outside:
     """The person that ``seed`` draws, scanned; without ``heart``, only what surrounds it.
 
-    ``illness``: one of `tests.outside_anatomy.ILLNESSES` that the same person has.
+    ``illness``: one of `tests.outside_people.ILLNESSES` that the same person has.
 
     The same seed gives the same person, plan and shifts whatever the scan's phases are.
     """

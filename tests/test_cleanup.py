@@ -105,6 +105,16 @@ def test_muscle_without_cavity_between_two_rings_gets_the_cavity_that_both_share
     np.testing.assert_array_equal(found[[0, 2]], whole[[0, 2]])
 
 
+def test_more_muscle_about_a_small_basal_cavity_does_not_empty_the_rings_below():
+    """As where a right ventricle's thick wall is taken for the left one's at the base."""
+    rings = np.stack([ring(6 + 2 * k, 12 + 2 * k) for k in range(5)])
+    base = ring(6, 28)
+    assert (base == MUSCLE).sum() > (rings[-1] == MUSCLE).sum()
+    assert (rings[-1] == CAVITY).sum() > 1.4 * (base == CAVITY).sum() + 40
+    heart = np.concatenate([rings, base[None]])
+    np.testing.assert_array_equal(cleaned(heart), heart)
+
+
 def test_the_tip_is_the_same_in_every_phase():
     """Fat about the tip taken for muscle in two phases of three is cut off in all, or in none."""
     tapering = np.stack([ring(2 + 3 * k, 8 + 3 * k) for k in range(5)])

@@ -11,16 +11,14 @@ from pipeline.errors import StageError
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
-from tests import outside_anatomy, outside_chest, outside_heart, outside_shapes
+from tests import outside_anatomy, outside_chest, outside_heart, outside_people, outside_shapes
 from tests.outside_anatomy import (
-    ILLNESSES,
     Stuff,
-    draw_body,
     heart_stuff,
     left_ventricle,
-    made_ill,
 )
 from tests.outside_heart import Scan, render, steady_state, without_heart
+from tests.outside_people import ILLNESSES, draw_body, made_ill
 
 SEEDS = (1, 2, 3)
 """Three people; nothing was chosen by what they give."""
@@ -79,7 +77,13 @@ def test_images_that_show_nothing_are_refused(kind):
 
 
 def test_the_renderer_shares_nothing_with_the_phantom():
-    for module in (outside_anatomy, outside_chest, outside_heart, outside_shapes):
+    for module in (
+        outside_anatomy,
+        outside_chest,
+        outside_heart,
+        outside_people,
+        outside_shapes,
+    ):
         tree = ast.parse(Path(module.__file__).read_text())
         named = [
             name
@@ -152,7 +156,7 @@ def test_illnesses_are_as_they_say(seed):
             assert septum == pytest.approx(side, abs=1.5)
             usual = np.isin(along_x(body)[1], RIGHT).sum()
             assert np.isin(stuff, RIGHT).sum() > 1.2 * usual
-        else:
+        elif illness not in ("scar", "right"):
             assert septum - side == pytest.approx(2 * ill.lopsided, abs=0.5)
             assert inside[-1] + inside[0] == pytest.approx(-2 * ill.lopsided, abs=0.5)
         if illness == "thick":
@@ -164,6 +168,61 @@ def test_illnesses_are_as_they_say(seed):
             # Men's normal ones are up to 58 mm wide (Lang et al., J. Am. Soc. Echocardiogr.
             # 28:1-39, 2015).
             assert inside[-1] - inside[0] > 58
+        if illness == "right":
+            free = x[(stuff == Stuff.WALL) & (x > x[np.isin(stuff, RIGHT)].max())]
+            # Slanting walls and flat ellipsoids are thicker along the line than they are.
+            assert 0.9 * ill.rv_wall < len(free) / 10 < 2 * ill.rv_wall
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_scar_is_as_thin_as_it_says_and_bulges_at_end_systole(seed):
+    rng = np.random.default_rng([seed, 6])
+    body = replace(draw_body(rng), squash=1.0, mitral_tilt=0.0, trabeculae=-9.0)
+    ill = made_ill(rng, body, "scar")
+    scar, reached = ill.scar, []
+    for phase in (0.0, ill.systole):
+        now = left_ventricle(ill, phase)
+        size = np.array([now.radius + now.wall] * 2 + [0.55 * now.length + now.wall])
+        place = np.array([0, 0, now.base - 0.45 * now.length]) + size * scar.way
+        # Along the ellipsoid's own direction outwards there.
+        out = scar.way / size
+        out /= np.linalg.norm(out)
+        along = np.arange(-25, 25, 0.1)
+        line = (place + along[:, None] * out).astype(np.float32)
+        muscle = along[heart_stuff(ill, line, phase) == Stuff.LV_MUSCLE]
+        whole = along[heart_stuff(replace(ill, scar=None), line, phase) == Stuff.LV_MUSCLE]
+        # What papillary muscles stand there are the cavity's. A tip may be thinner than its scar.
+        thick = len(muscle) / 10
+        assert thick < 1.25 * scar.wall + 0.3
+        assert thick > 0.75 * min(scar.wall, len(whole) / 10) - 0.3
+        reached.append(muscle[-1] - whole[-1])
+    assert reached[0] == pytest.approx(0.3 * scar.bulge, abs=0.15 * scar.bulge + 0.3)
+    assert reached[1] == pytest.approx(scar.bulge, abs=0.3 * scar.bulge + 0.3)
+
+
+def test_fluid_surrounds_the_heart_and_changes_nothing_of_it():
+    rng = np.random.default_rng(7)
+    ill = made_ill(rng, draw_body(rng), "fluid")
+    points = rng.uniform((-80, -80, -110), (100, 80, 80), (200_000, 3)).astype(np.float32)
+    was, now = (heart_stuff(one, points, 0.2) for one in (replace(ill, fluid=0.0), ill))
+    changed = was != now
+    assert set(was[changed]) <= {Stuff.NONE, Stuff.FAT, Stuff.PERICARDIUM}
+    assert set(now[changed]) == {Stuff.SPINAL_FLUID, Stuff.PERICARDIUM}
+    cell_ml = 180 * 160 * 190 / 1000 / len(points)
+    assert 50 < (now == Stuff.SPINAL_FLUID).sum() * cell_ml < 800
+
+
+def test_a_spongy_wall_fills_more_of_the_cavity():
+    rng = np.random.default_rng(9)
+    body = draw_body(rng)
+    ill = made_ill(rng, body, "spongy")
+    points = rng.uniform((-40, -40, -100), (40, 40, 0), (100_000, 3)).astype(np.float32)
+    shares = []
+    for one in (replace(ill, sponge=0.0, trabeculae=body.trabeculae), ill):
+        stuff = heart_stuff(one, points, 0.0)
+        knots = (stuff == Stuff.LV_PAPILLARY).sum()
+        shares.append(knots / (knots + (stuff == Stuff.LV_BLOOD).sum()))
+    assert shares[1] > 2 * shares[0]
 
 
 def test_an_unknown_illness_is_refused():

@@ -19,10 +19,16 @@ Float32 = npt.NDArray[np.float32]
 Label = npt.NDArray[np.uint8]
 
 
+_DRY = np.isin(np.arange(256), (Tissue.BLOOD_VESSEL, Tissue.BONE, Tissue.MUSCLE))
+"""Where no fluid gathers, for every tissue."""
+
+
 class Coverings:
     """Layers on the outside of one heart, the same in all slices of an image."""
 
-    def __init__(self, rng: np.random.Generator, side: int, contrast: Contrast) -> None:
+    def __init__(
+        self, rng: np.random.Generator, side: int, contrast: Contrast, fluid: bool = False
+    ) -> None:
         thick_px, chance = rng.uniform(0.0, 1.0), rng.random()
         if chance < 0.35:
             thick_px = 0.0
@@ -38,6 +44,13 @@ class Coverings:
         self.fat = contrast.mean[Tissue.FAT] if rng.random() < 0.85 else beside
         # Fibrous and dark; as grey as muscle in a few, which no edge then tells apart.
         self.sac = contrast.muscle * (rng.uniform(0.0, 0.7) if rng.random() < 0.9 else 1.0)
+        self.fluid_px, self.fluid = np.zeros_like(self.fat_px), 0.0
+        if fluid and rng.random() < 0.12:
+            # Between fat and pericardium, as bright as blood or brighter; it gathers in places.
+            uneven = rng.uniform(0.0, 0.9) * smooth_noise(rng, side, int(rng.integers(2, 6)))
+            self.fluid_px = np.clip(rng.uniform(1.5, 10.0) * (1 + uneven), 0, 12.0)
+            self.fat_px = np.minimum(self.fat_px, rng.uniform(0.0, 3.0))
+            self.fluid = contrast.mean[Tissue.LV_CAVITY] * rng.uniform(0.7, 2.0)
 
     def paint(self, signed: Float32, tissue: Label) -> None:
         """Cover the heart in one plane, in place.
@@ -54,9 +67,11 @@ class Coverings:
             return
         away_px = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
         # A pixel at distance d reaches from d - 1 to d beyond the outline between pixels.
-        near = (away_px > 0) & (away_px < self.fat_px.max() + self.sac_px + 1)
-        within, fat = away_px[near] - 1, self.fat_px[near]
-        of_fat = np.clip(fat - within, 0, 1)
-        of_both = np.clip(fat + self.sac_px - within, 0, 1)
-        beyond = (1 - of_both) * signed[near]
-        signed[near] = of_fat * self.fat + (of_both - of_fat) * self.sac + beyond
+        fluid_px = np.where(_DRY[tissue], 0, self.fluid_px)
+        ends_px = np.stack([self.fat_px, self.fat_px + fluid_px])
+        ends_px = np.stack([*ends_px, ends_px[1] + self.sac_px])
+        near = (away_px > 0) & (away_px < ends_px[2].max() + 1)
+        covered = np.clip(ends_px[:, near] - (away_px[near] - 1), 0, 1)
+        of_fat, of_fluid, of_sac = np.diff(covered, axis=0, prepend=np.float32(0))
+        beyond = (1 - covered[2]) * signed[near]
+        signed[near] = of_fat * self.fat + of_fluid * self.fluid + of_sac * self.sac + beyond

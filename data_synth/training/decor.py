@@ -30,7 +30,13 @@ class Decor:
     """
 
     def __init__(
-        self, rng: np.random.Generator, side: int, rims: bool, fat: bool, fine: bool = True
+        self,
+        rng: np.random.Generator,
+        side: int,
+        rims: bool,
+        fat: bool,
+        fine: bool = True,
+        spongy: bool = False,
     ) -> None:
         self.fine = smooth_noise(rng, side, side // int(rng.integers(3, 9)))
         self.coarse = [smooth_noise(rng, side, int(rng.integers(4, 20))) for _ in range(3)]
@@ -56,6 +62,8 @@ class Decor:
         if fine and rng.random() < 0.7:
             self.jets = self.jets[:0]
         self.septum_bare = fine and rng.random() < 0.5
+        if spongy and rng.random() < 0.12:
+            self.strands[Tissue.LV_CAVITY] = _Strands.dense(rng)
 
     def paint(
         self, image: Float32, tissue: Label, contrast: Contrast, heart: Mask | None = None
@@ -137,6 +145,9 @@ class _Strands:
     share: float
     """Of muscle in a pixel."""
 
+    most: float = 0.6
+    """How far they reach at most, of the way to the chamber's middle."""
+
     @classmethod
     def draw(cls, rng: np.random.Generator, deepest_px: float) -> _Strands:
         """Draw them for one chamber; three in four have some, a few are nearly filled."""
@@ -144,6 +155,11 @@ class _Strands:
         if rng.random() < 0.05:
             depth_px = 2 * deepest_px
         return cls(depth_px, rng.uniform(-0.7, 1.2), rng.uniform(0.2, 1.0))
+
+    @classmethod
+    def dense(cls, rng: np.random.Generator) -> _Strands:
+        """Draw those of a wall that never became compact."""
+        return cls(*rng.uniform((5.0, -0.5, 0.6, 0.6), (16.0, 0.6, 1.0, 1.3)))
 
     def paint(
         self, muscle: Float32, cavity: Mask, beside: Mask, fine: Float32, coarse: Float32
@@ -155,7 +171,8 @@ class _Strands:
         if self.depth_px == 0 or not cavity.any():
             return
         depth = cv2.distanceTransform(beside.astype(np.uint8), cv2.DIST_L2, 3)
-        limit = min(self.depth_px, 0.6 * float(depth[cavity].max())) * (1 + 0.5 * coarse)
+        deepest_px = self.most * float(depth[cavity].max())
+        limit = min(self.depth_px, deepest_px) * (1 + 0.5 * coarse)
         above = self.level + 0.5 * (depth / np.maximum(limit, 0.3) - 0.5)
         muscle[cavity & (depth < limit) & (fine > above)] = self.share
 

@@ -31,6 +31,7 @@ from data_synth.training.ends import (
     shut_tip,
 )
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
+from data_synth.training.rare import bulged, draw_scar, scarred, thick_right_walled
 from data_synth.training.sizes import Places, ill_shape, other_sizes, swollen
 from data_synth.training.walls import (
     laid_bare,
@@ -100,6 +101,10 @@ class Parts:
     """Hearts at their worst: right ventricles so wide that they flatten the septum and reach past
     the tip, left ones nearly shut within a thick wall, or wide and thin."""
 
+    rare: bool = True
+    """Infarcts that leave a wall thin and bulging, right ventricles with thick walls, left ones
+    full of trabeculae, and fluid about the heart."""
+
 
 ALL_PARTS = Parts()
 
@@ -118,16 +123,27 @@ class Sample:
 def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS) -> Sample:
     """Draw one image and its labels from a ``(plane, row, column)`` tissue block."""
     planes, end = _draw_planes(rng, block, parts)
+    scar = draw_scar(rng, planes[REACH]) if parts.rare and rng.random() < 0.12 else None
+    if scar is not None:
+        planes = scarred(rng, planes, scar)
     bare = parts.bare and rng.random() < 0.55
     if bare:
         planes = laid_bare(rng, planes, skin=not parts.fine)
     contrast = draw_contrast(rng) if parts.contrast else USUAL_CONTRAST
+    if parts.rare and rng.random() < 0.12:
+        planes = thick_right_walled(planes, int(rng.integers(1, 5)))
+        # So thick a wall is muscle like the left one's, and shares few pixels with others.
+        mean = contrast.mean.copy()
+        mean[Tissue.RV_WALL] = contrast.muscle * rng.uniform(0.85, 1.15)
+        contrast = replace(contrast, mean=mean)
     slices = _thick_slices(rng, planes, contrast, parts, fat=not bare or rng.random() < 0.3)
     rows, columns = _draw_positions(rng, planes[REACH], parts.shape)
     if parts.fine and parts.shape:
         rows, columns = other_sizes(rng, planes[REACH], rows, columns)
     if parts.ill and parts.shape:
         rows, columns = ill_shape(rng, planes[REACH], rows, columns)
+    if scar is not None and parts.shape and rng.random() < 0.6:
+        rows, columns = bulged(rng, scar, rows, columns)
     image = np.empty((3, CROP, CROP), np.float32)
     strays = parts.neighbours and rng.random() < 0.7
     strayed_px = rng.uniform(0.0, 2.2) if strays else 0.0
@@ -286,13 +302,15 @@ def _thick_slices(
     decor = None
     if parts.detail:
         own = parts.rims and not parts.fine, fat and not parts.fine
-        decor = Decor(rng, side, *own, fine=parts.fine)
+        decor = Decor(rng, side, *own, fine=parts.fine, spongy=parts.rare)
     mean = contrast.mean.copy()
     if rng.random() < (0.65 if parts.fine else 0.5):
         # Balanced steady state at usual repetition times: fat is opposed, its borders are black.
         mean[Tissue.FAT] *= -1
     border_px = rng.uniform(0.35, 0.7)
-    covers = Coverings(rng, side, replace(contrast, mean=mean)) if parts.fine else None
+    covers = None
+    if parts.fine:
+        covers = Coverings(rng, side, replace(contrast, mean=mean), fluid=parts.rare)
     if covers is not None:
         mean[Tissue.PERICARDIUM] = covers.sac
     images = np.empty((3, side, side), np.float32)

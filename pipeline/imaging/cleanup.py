@@ -211,7 +211,11 @@ def _close_apex(part: Float32, tip: int) -> None:
     """
     labels = part.argmax(axis=1)
     inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
-    widest = int((labels == MUSCLE).sum(axis=(1, 2)).argmax())
+    # The widest ring: a thick wall of the right ventricle may be taken for more muscle than any.
+    rings = np.array([_ringed(plane) > CLOSED_SHARE for plane in labels])
+    rings[:tip] = False
+    size = (inside * rings[:, None, None] if rings.any() else labels == MUSCLE).sum(axis=(1, 2))
+    widest = int(size.argmax())
     has_cavity = True
     for number in range(widest, -1, -1):
         above = min(number + 1, widest)
