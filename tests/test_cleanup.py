@@ -115,6 +115,14 @@ def test_more_muscle_about_a_small_basal_cavity_does_not_empty_the_rings_below()
     np.testing.assert_array_equal(cleaned(heart), heart)
 
 
+def test_a_bare_cavity_at_the_tip_goes_though_a_wide_ring_of_fat_lies_below_it():
+    rings = np.stack([ring(6 + 2 * k, 12 + 2 * k) for k in range(5)])
+    bare, fat = ring(5, 5), ring(20, 27)
+    found = cleaned(np.concatenate([[fat, bare], rings]))
+    np.testing.assert_array_equal(found[2:], rings)
+    assert not (found[:2] == CAVITY).any()
+
+
 def test_the_tip_is_the_same_in_every_phase():
     """Fat about the tip taken for muscle in two phases of three is cut off in all, or in none."""
     tapering = np.stack([ring(2 + 3 * k, 8 + 3 * k) for k in range(5)])

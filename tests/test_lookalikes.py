@@ -63,6 +63,17 @@ def test_discs_that_melt_into_one_are_parted_where_they_part_below():
     assert (found[2][BESIDE] == RV).all()
 
 
+def test_a_root_that_leans_over_the_right_heart_beside_its_disc_stays_whole():
+    leaning, aside = disc(32, 32, 8), disc(22, 18, 8)
+    assert 0.15 < BESIDE[leaning].mean() < 0.5 * ROOT[leaning].mean()
+    assert BESIDE[aside].mean() > 0.5
+    alone = np.where(leaning, AORTA, 0)
+    found = parted([below(), BOTH, np.where(aside, AORTA, alone), alone, alone], second=RV)
+    for plane in found[2:]:
+        np.testing.assert_array_equal(plane[leaning], AORTA)
+    np.testing.assert_array_equal(found[2][aside], RV)
+
+
 def test_an_aorta_alone_stays_whatever_lies_beneath_it():
     alone = np.where(BESIDE, AORTA, 0)
     spotted = alone.copy()

@@ -200,6 +200,17 @@ def test_a_scar_is_as_thin_as_it_says_and_bulges_at_end_systole(seed):
     assert reached[1] == pytest.approx(scar.bulge, abs=0.3 * scar.bulge + 0.3)
 
 
+def test_a_thick_right_wall_takes_nothing_of_aorta_and_atria():
+    rng = np.random.default_rng(11)
+    points = rng.uniform((-60, -70, -110), (110, 80, 90), (200_000, 3)).astype(np.float32)
+    for _ in range(5):
+        ill = made_ill(rng, draw_body(rng), "right")
+        was, now = (heart_stuff(one, points, 0.1) for one in (replace(ill, rv_wall=2.5), ill))
+        assert (now == Stuff.WALL).sum() > (was == Stuff.WALL).sum()
+        for kind in (Stuff.AORTA, Stuff.LEFT_ATRIUM, Stuff.RIGHT_ATRIUM, Stuff.RV_BLOOD):
+            np.testing.assert_array_equal(now == kind, was == kind)
+
+
 def test_fluid_surrounds_the_heart_and_changes_nothing_of_it():
     rng = np.random.default_rng(7)
     ill = made_ill(rng, draw_body(rng), "fluid")

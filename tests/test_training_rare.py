@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from data_synth.tissue import Tissue
+from data_synth.training import render
 from data_synth.training.rare import bulged, draw_scar, scarred, thick_right_walled
 from data_synth.training.render import ALL_PARTS, draw_sample
 
@@ -102,6 +103,28 @@ def test_a_bulge_pushes_the_ventricle_outwards_at_its_scar_and_nothing_folds(see
     assert (taken <= drawn + 1e-4).all()
     rim = tuple(np.rint(MIDDLE + scar.radius * scar.way).astype(int))
     assert (drawn - taken)[rim] > 0.9 * 0.1 / np.e * 0.5 * scar.radius
+
+
+def test_a_thick_right_wall_is_as_grey_as_the_left_one(monkeypatch):
+    grown, greys = [], {True: [], False: []}
+    slices = render._thick_slices
+
+    def noted(planes, layers):
+        grown.append(layers)
+        return planes
+
+    def seen(rng, planes, contrast, *others, **more):
+        greys[bool(grown)].append(contrast.mean[Tissue.RV_WALL] / contrast.muscle)
+        grown.clear()
+        return slices(rng, planes, contrast, *others, **more)
+
+    monkeypatch.setattr(render, "thick_right_walled", noted)
+    monkeypatch.setattr(render, "_thick_slices", seen)
+    block = np.repeat(short_axis()[None], 16, axis=0)
+    for seed in range(100):
+        draw_sample(np.random.default_rng(seed), block)
+    assert 0.85 <= min(greys[True]) < max(greys[True]) <= 1.15
+    assert min(greys[False]) < 0.6
 
 
 @pytest.mark.parametrize("rare", [True, False])

@@ -68,15 +68,20 @@ def part_from_right_heart(part: Float32, pixel_mm: float) -> None:
     taken = np.zeros(labels.shape, bool)
     for number, plane in enumerate(labels == AORTA):
         beneath = right[number - 1] if number else np.zeros_like(plane)
-        for disc in _discs(plane, pixel_mm):
+        discs = _discs(plane, pixel_mm)
+        on_right = [float(beneath[disc].mean()) for disc in discs]
+        for disc, share in zip(discs, on_right, strict=True):
+            on_root = float(root[number - 1][disc].mean()) if number else 0.0
+            # Beside a disc that is the right heart's, another that stands on the root is it.
+            if max(on_right) > 0.5 and 2 * share < on_root:
+                continue
             # Where two discs have melted into one, each pixel goes with the nearer one beneath.
-            shared = number > 0 and min(beneath[disc].mean(), root[number - 1][disc].mean())
-            if shared > SHARED:
+            if min(share, on_root) > SHARED:
                 to_right = ndimage.distance_transform_edt(~beneath)
                 taken[number] |= disc & (
                     to_right < ndimage.distance_transform_edt(~root[number - 1])
                 )
-            elif beneath[disc].mean() > 0.5:
+            elif share > 0.5:
                 taken[number] |= disc
         right[number] |= taken[number]
         root[number] = plane & ~taken[number]
