@@ -123,10 +123,8 @@ def bulged(
     rows, columns
         Where in the plane each pixel of the image lies.
     """
-    place, reach_px = (
-        scar.middle + 0.5 * scar.radius * scar.way,
-        scar.radius * rng.uniform(0.5, 0.9),
-    )
+    place = scar.middle + 0.5 * scar.radius * scar.way
+    reach_px = scar.radius * rng.uniform(0.5, 0.9)
     away_rows, away_columns = rows - place[0], columns - place[1]
     # Below half, positions follow one another as before: nothing folds.
     change = -rng.uniform(0.1, 0.5) * np.exp(-(away_rows**2 + away_columns**2) / reach_px**2)
