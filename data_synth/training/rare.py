@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from data_synth.tissue import Tissue
 from data_synth.training.contrast import IN_HEART
+from data_synth.training.walls import closed_ring
 
 Float = npt.NDArray[np.floating]
 Label = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
 
 _INSIDE = (Tissue.LV_CAVITY, Tissue.PAPILLARY_MUSCLE)
 _LEFT = (*_INSIDE, Tissue.LV_MYOCARDIUM, Tissue.SCAR)
@@ -23,9 +23,6 @@ _KEPT = (Tissue.AIR, Tissue.MUSCLE, Tissue.BONE, Tissue.BLOOD_VESSEL)
 
 _LEAST_AREA = 150
 """Pixels of a ventricle that is well in the plane."""
-
-_CLOSED_SHARE = 0.9
-"""Of what borders on the cavity, this share must be muscle in a ring."""
 
 
 def thick_right_walled(planes: Label, layers: int) -> Label:
@@ -94,7 +91,7 @@ def scarred(rng: np.random.Generator, planes: Label, scar: Scar) -> Label:
     for number, plane in enumerate(thinner):
         size = 1 - ((number - centre) / through) ** 2
         left, inside = np.isin(plane, _LEFT), np.isin(plane, _INSIDE)
-        if size <= 0 or not _closed(left, inside):
+        if size <= 0 or not closed_ring(plane):
             continue
         # Thin over the inner six tenths of its reach; from there to its rim all of the wall stays.
         share = (away / (reach_px * np.sqrt(size)) - 0.6) / 0.4
@@ -105,12 +102,6 @@ def scarred(rng: np.random.Generator, planes: Label, scar: Scar) -> Label:
         _, part = cv2.connectedComponents((thin | inside).astype(np.uint8), connectivity=4)
         plane[thin & np.isin(part, np.unique(part[inside]))] = Tissue.LV_CAVITY
     return thinner
-
-
-def _closed(left: Mask, inside: Mask) -> bool:
-    """Whether muscle surrounds a cavity."""
-    around = (cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~inside
-    return bool(inside.any() and left[around].mean() > _CLOSED_SHARE)
 
 
 def bulged(

@@ -43,10 +43,16 @@ def last_ring(planes: Label) -> int | None:
         inside = np.isin(planes[number], _INSIDE)
         if np.count_nonzero(inside) < _LEAST_CAVITY:
             continue
-        around = (cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~inside
-        if np.isin(planes[number][around], _MUSCLE).mean() >= _CLOSED_SHARE:
+        if closed_ring(planes[number]):
             return number
     return None
+
+
+def closed_ring(plane: Label) -> bool:
+    """Whether a plane shows the left ventricle's cavity, and muscle nearly all around it."""
+    inside = np.isin(plane, _INSIDE)
+    around = (cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~inside
+    return bool(inside.any() and np.isin(plane[around], _MUSCLE).mean() >= _CLOSED_SHARE)
 
 
 def long_walled(planes: Label, ring: int, farther: int) -> Label:
