@@ -126,13 +126,83 @@ def test_a_half_bare_cavity_at_the_tip_goes_though_a_wide_ring_of_fat_lies_below
     assert not (found[:2] == CAVITY).any()
 
 
+def rings_with_right_heart(inner):
+    rings = np.stack([ring(size, size + 6) for size in inner])
+    beside = (np.hypot(X - 10, Y - 32) < 9) & (rings == 0)
+    return np.where(beside, RV, rings)
+
+
+def test_a_right_chamber_taken_for_cavity_leaves_the_rings_below_as_they_are():
+    heart = rings_with_right_heart([6, 8, 10, 11, 12])
+    mistaken = heart.copy()
+    mistaken[2:][heart[2:] == RV] = CAVITY
+    # The septum borders on a quarter of it. In the last plane, above all rings, both are one body.
+    mistaken[4][(X < 32) & (abs(Y - 32) < 9) & (heart[4] == MUSCLE)] = CAVITY
+    found = cleaned(mistaken)[:4]
+    np.testing.assert_array_equal(found == CAVITY, heart[:4] == CAVITY)
+    np.testing.assert_array_equal(found == MUSCLE, heart[:4] == MUSCLE)
+
+
+def test_a_chamber_beyond_the_base_without_muscle_is_no_cavity():
+    heart = rings_with_right_heart([6, 8, 10, 11])
+    # The pulmonary artery, above the right ventricle; and the outflow tract, above the cavity.
+    artery, outflow = np.hypot(X - 17, Y - 32) < 9, np.hypot(X - 36, Y - 32) < 9
+    for beyond, stays in ((artery, False), (outflow, True)):
+        more = np.where(beyond, CAVITY, 0)
+        found = cleaned(np.concatenate([heart, [more, more]]))
+        np.testing.assert_array_equal(found[:4], heart)
+        np.testing.assert_array_equal(found[4:] == CAVITY, np.stack([beyond & stays] * 2))
+
+
+def test_a_cavity_that_leaks_between_two_rings_is_held_within_them():
+    heart = rings_with_right_heart([6, 8, 10, 11, 12])
+    leaking = heart.copy()
+    # The septum is missed, and most of the right chamber taken for the left one.
+    right, septum = (heart[2] == RV) & (Y > 24), (heart[2] == MUSCLE) & (X < 32)
+    leaking[2][right | (septum & (abs(Y - 32) < 12))] = CAVITY
+    found = cleaned(leaking)
+    np.testing.assert_array_equal(np.delete(found, 2, 0), np.delete(heart, 2, 0))
+    held = np.isin(heart[1], (CAVITY, MUSCLE)) | np.isin(heart[3], (CAVITY, MUSCLE))
+    assert not (found[2] == CAVITY)[~held].any()
+    assert (found[2] == CAVITY)[(leaking[2] == CAVITY) & held].all()
+
+
+def test_an_aneurysm_that_widens_by_degrees_is_left_as_it_is():
+    rings = [ring(size, size + 6) for size in (8, 14, 14)]
+    # Half of its wall is too thin to be seen, so that no ring is there.
+    bulge = [ring(size, size + 6) for size in (15, 16.5, 18, 16.5, 15)]
+    bulge = [np.where((X < 32) & (plane == MUSCLE), 0, plane) for plane in bulge]
+    heart = np.stack([*rings[:2], *bulge, rings[2]])
+    assert (heart[4] == CAVITY).sum() > 1.4 * (heart[1] == CAVITY).sum() + 40
+    np.testing.assert_array_equal(cleaned(heart), heart)
+
+
+def test_a_recess_walled_by_muscle_does_not_take_the_open_cavity_beside_it():
+    base = np.where((X > 20) & (RADIUS >= 14), 0, ring(14, 20))
+    recess = (X >= 15) & (X < 17) & (abs(Y - 32) < 2)
+    heart = np.stack([ring(12, 20), ring(13, 20), base])
+    heart[:, recess] = CAVITY
+    found = cleaned(heart)
+    assert (found[2] == CAVITY)[(base == CAVITY)].all()
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_how_far_a_ventricle_may_widen_does_not_depend_on_the_pixels(finer):
+    heart = np.stack([ring(7.7, 14), ring(6, 14), ring(8, 14), ring(10, 16)])
+    heart = heart.repeat(finer, axis=1).repeat(finer, axis=2)
+    found = clean_probability(one_hot(heart), pixel_mm=PIXEL_MM / finer).argmax(axis=1)
+    np.testing.assert_array_equal(found > 0, heart > 0)
+    assert (found == CAVITY)[heart == CAVITY].all()
+
+
 def test_the_tip_is_the_same_in_every_phase():
     """Fat about the tip taken for muscle in two phases of three is cut off in all, or in none."""
     tapering = np.stack([ring(2 + 3 * k, 8 + 3 * k) for k in range(5)])
     fat = tapering.copy()
-    fat[0] = np.where(RADIUS < 20, MUSCLE, 0)
+    # On average over phases 1.4 times the next cut and 60 to 80 pixels, which are 135 to 180 mm2.
+    fat[0] = np.where(RADIUS < 15.9, MUSCLE, 0)
     value = one_hot(np.stack([fat, tapering, fat]))
-    assert ventricle_tip(value) == 1
+    assert ventricle_tip(value, PIXEL_MM) == 1
     clean_cycle(value, PIXEL_MM)
     ventricle = np.isin(value.argmax(axis=2), (CAVITY, MUSCLE))
     assert not ventricle[:, 0].any()
@@ -144,6 +214,6 @@ def test_probabilities_still_sum_to_one(phases):
     rng = np.random.default_rng(0)
     value = np.moveaxis(rng.dirichlet(np.ones(7) / 3, (phases, 4, SIDE, SIDE)), -1, 2)
     value = value.astype(np.float32)
-    clean_cycle(value)
+    clean_cycle(value, PIXEL_MM)
     np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-4)
     assert value.min() >= 0

@@ -322,7 +322,7 @@ def test_cleaning_removes_islands_and_fills_holes():
     labels[1, 9, 9] = 0
     labels[0, 26:28, 26:28] = 1
     labels[2, 3, 3] = 1
-    found = clean_probability(one_hot(labels)).argmax(axis=1)
+    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
     # What stands where something was ruled out is the next guess; here all others are equal.
     assert found[1, 9, 9] != 0
     assert not found[0, 20:, 20:].any()
@@ -335,7 +335,9 @@ def test_cleaning_keeps_a_part_whose_neck_is_too_thin_to_be_seen():
     labels = np.zeros((5, 30, 30), int)
     labels[:, 4:16, 4:16] = 4
     labels[1:3, 8:14, 17:22] = 4
-    np.testing.assert_array_equal(clean_probability(one_hot(labels)).argmax(axis=1), labels)
+    np.testing.assert_array_equal(
+        clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1), labels
+    )
 
 
 def test_cleaning_takes_a_bare_cavity_off_the_tip_but_not_off_the_base():
@@ -343,7 +345,7 @@ def test_cleaning_takes_a_bare_cavity_off_the_tip_but_not_off_the_base():
     labels[1:4, 4:16, 4:16] = 2
     labels[2:4, 7:13, 7:13] = 1
     labels[[0, 4], 7:13, 7:13] = 1
-    found = clean_probability(one_hot(labels)).argmax(axis=1)
+    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
     assert not (found[0] == 1).any()
     np.testing.assert_array_equal(found[1:] == 1, labels[1:] == 1)
 
@@ -354,17 +356,17 @@ def test_cleaning_takes_a_ventricle_off_that_leaps_in_size_below_the_tip():
         labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 2
         half = half // 2 if number else 11
         labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 1
-    found = clean_probability(one_hot(labels)).argmax(axis=1)
+    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
     assert not np.isin(found[0], (1, 2)).any()
     np.testing.assert_array_equal(found[1:], labels[1:])
 
 
 def test_cleaning_keeps_probabilities_and_leaves_empty_images_alone():
     chance = np.random.default_rng(0).dirichlet(np.ones(7), (2, 9, 9)).astype(np.float32)
-    cleaned = clean_probability(np.moveaxis(chance, -1, 1))
+    cleaned = clean_probability(np.moveaxis(chance, -1, 1), view.PIXEL_MM)
     np.testing.assert_allclose(cleaned.sum(axis=1), 1, atol=1e-5)
     nothing = one_hot(np.zeros((2, 8, 8), int))
-    np.testing.assert_array_equal(clean_probability(nothing), nothing)
+    np.testing.assert_array_equal(clean_probability(nothing, view.PIXEL_MM), nothing)
 
 
 def test_blending_is_cyclic_and_keeps_the_sum():
@@ -385,7 +387,7 @@ def test_an_auricle_is_joined_along_a_likely_neck_and_no_other(neck, joined):
     place[2, 19:21, 25:29] = neck
     probability[:, atrium], probability[:, 0] = place, 1 - place
 
-    found = clean_probability(probability).argmax(axis=1) == atrium
+    found = clean_probability(probability, view.PIXEL_MM).argmax(axis=1) == atrium
 
     assert found[2, 20, 40] == joined
     assert found[2, 20, 27] == joined

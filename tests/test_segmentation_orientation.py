@@ -13,8 +13,16 @@ from pipeline.imaging import inference, orientation, view
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.inference import TURNS_DEG, count_turns
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.locating import locate_heart
-from pipeline.imaging.network import normalise, normalise_locally
+from pipeline.imaging.locating import (
+    FIELD_MM,
+    FINEST_MM,
+    PIXELS_ACROSS,
+    SHOWN_MM,
+    SURROUNDINGS_MM,
+    locate_heart,
+    view_around,
+)
+from pipeline.imaging.network import MULTIPLE, WINDOW, normalise, normalise_locally
 from pipeline.imaging.orientation import RIGHT_DEG, find_orientation, lie_of
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
@@ -117,6 +125,38 @@ def test_without_a_right_ventricle_only_the_order_of_slices_can_be_told():
     found = find_orientation(look)
     assert found.upside_down
     assert found.turn_deg == 0
+
+
+@given(
+    first=st.tuples(st.integers(0, 60), st.integers(0, 60)),
+    size=st.tuples(st.integers(4, 160), st.integers(4, 160)),
+    turn_deg=st.floats(-180, 180),
+)
+@settings(max_examples=60)
+def test_a_heart_is_labelled_with_its_surroundings_in_finer_pixels_the_smaller_it_is(
+    first, size, turn_deg
+):
+    stack = np.zeros((2, 3, 64, 64), np.float32)
+    cine = Cine(stack, np.diag([2.0, 2, 8, 1]), np.array([0, 0.4]), 0.8)
+    whole = view_of(cine, Orientation(turn_deg))
+    box = [slice(start, start + side) for start, side in zip(first, size, strict=True)]
+    shown = view_around(whole, *box)
+    across_mm = whole.pixel_mm * max(size)
+    assert FINEST_MM <= shown.pixel_mm <= SHOWN_MM
+    if FINEST_MM < shown.pixel_mm < SHOWN_MM:
+        assert across_mm / shown.pixel_mm == pytest.approx(PIXELS_ACROSS)
+    assert min(shown.shape) >= max(WINDOW, FIELD_MM / shown.pixel_mm)
+    assert np.remainder(shown.shape, MULTIPLE).tolist() == [0, 0]
+    # The box's outer corners, half a pixel beyond its pixels' middles, in the new view's pixels.
+    low, high = [side.start - 0.5 for side in box], [side.stop - 0.5 for side in box]
+    to_shown = whole.pixels_of(shown)
+    corners = [to_shown @ [corner[1], corner[0], 1] for corner in (low, high)]
+    room = SURROUNDINGS_MM / shown.pixel_mm
+    for corner, other, side in zip(*corners, shown.shape[::-1], strict=True):
+        assert corner - room >= -0.5 - 1e-6
+        assert other + room <= side - 0.5 + 1e-6
+        # It lies in the middle.
+        assert corner + other == pytest.approx(side - 1, abs=1e-6)
 
 
 @given(lost)

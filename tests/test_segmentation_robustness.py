@@ -30,13 +30,15 @@ REQUIRED = {"lv_cavity": 0.95, "lv_myocardium": 0.89, "rv_cavity": 0.93}
 """Dice required on the phantom's own images."""
 
 
-@pytest.fixture(scope="module")
-def people():
-    """Truth and labels of each person at end-diastole and end-systole."""
+@pytest.fixture(scope="module", params=[1.0, 0.7], ids=["adults", "children"])
+def people(request):
+    """Truth and labels of each person at end-diastole and end-systole; a child is all smaller."""
     pairs = []
     for seed in SEEDS:
         outside = render(seed, Scan())
-        found = segment_cine(outside.cine, SegmentSettings())
+        frame = outside.cine.mr_from_index.copy()
+        frame[:3, :3] *= request.param
+        found = segment_cine(replace(outside.cine, mr_from_index=frame), SegmentSettings())
         pairs.append((outside.labels, found.labels))
     return pairs
 

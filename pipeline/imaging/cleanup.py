@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from scipy import ndimage
@@ -9,7 +12,6 @@ from scipy import ndimage
 from pipeline.geometry import Float32, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
-from pipeline.imaging.view import PIXEL_MM
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
@@ -33,9 +35,9 @@ NECK_BRUSH[[0, 2], 1:4, 1:4] = True
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
 
-LEAP, LEAP_PIXELS = 1.4, 40
-"""A cut through the ventricle may be so much larger, and so many pixels, than that of the plane
-before it towards the tip: room for an aneurysm, which widens by degrees."""
+LEAP, LEAP_MM2 = 1.4, 90.0
+"""A cut through the ventricle may be so much larger, and by so much, than that of the plane before
+it towards the tip: room for an aneurysm, which widens by degrees."""
 
 
 NOTCH_MM = 15.0
@@ -50,8 +52,11 @@ leaves of one."""
 CLOSED_SHARE = 0.6
 """A cavity with this share of muscle about it is taken for a ring that must be closed."""
 
+STRAY_SHARE, BARE_SHARE = 0.3, 0.1
+"""A cavity with less muscle about it is another chamber's, beside a ring and where none is."""
 
-def clean_cycle(value: Float32, pixel_mm: float = PIXEL_MM) -> None:
+
+def clean_cycle(value: Float32, pixel_mm: float) -> None:
     """Put the anatomy of all phases right, in place.
 
     Every phase is treated by `clean_probability`; the plane at which the left ventricle ends is
@@ -65,12 +70,12 @@ def clean_cycle(value: Float32, pixel_mm: float = PIXEL_MM) -> None:
     pixel_mm
         Distance between rows and between columns.
     """
-    tip = ventricle_tip(value)
+    tip = ventricle_tip(value, pixel_mm)
     for phase, probability in enumerate(value):
-        value[phase] = clean_probability(probability, tip, pixel_mm)
+        value[phase] = clean_probability(probability, pixel_mm, tip)
 
 
-def ventricle_tip(value: Float32) -> int:
+def ventricle_tip(value: Float32, pixel_mm: float) -> int:
     """The plane nearest the apex that can hold the left ventricle, seen over all phases.
 
     From its widest plane towards the tip the ventricle ends where it would leap to a larger cut:
@@ -78,14 +83,12 @@ def ventricle_tip(value: Float32) -> int:
     """
     cuts = ventricle_cuts(value)
     for number in range(int(cuts.argmax()) - 1, -1, -1):
-        if _leaps(cuts[number], cuts[number + 1]):
+        if _leaps(pixel_mm**2 * cuts[number], pixel_mm**2 * cuts[number + 1]):
             return number + 1
     return 0
 
 
-def clean_probability(
-    probability: Float32, tip: int | None = None, pixel_mm: float = PIXEL_MM
-) -> Float32:
+def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = None) -> Float32:
     """Take probability from structures where anatomy rules them out.
 
     The heart is one body and so is each of its structures; what lies enclosed by the heart in a
@@ -97,11 +100,11 @@ def clean_probability(
     ----------
     probability
         ``(plane, class, row, column)`` of one phase; class 0 is the background.
+    pixel_mm
+        Distance between rows and between columns.
     tip
         First plane that can hold the left ventricle (`ventricle_tip`); by default found from this
         phase alone.
-    pixel_mm
-        Distance between rows and between columns.
 
     Returns
     -------
@@ -113,7 +116,7 @@ def clean_probability(
     if box is None:
         return probability
     if tip is None:
-        tip = ventricle_tip(probability[None])
+        tip = ventricle_tip(probability[None], pixel_mm)
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
     _join_auricle(part)
@@ -125,10 +128,12 @@ def clean_probability(
     part[:, 1:] *= ~(whole & ~_largest_body(whole))[:, None]
     part[:, 0] *= ~enclosed
     # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
+    _hold_cavity(part, pixel_mm)
     _smooth_cavity(part, pixel_mm)
     _bridge_cavity(part)
     _keep_bodies(part)
-    _close_apex(part, tip)
+    _keep_ringed(part)
+    _close_apex(part, tip, pixel_mm)
     # What took over where something was ruled out may be an island itself.
     _keep_bodies(part)
     _close_ring(part, pixel_mm)
@@ -203,7 +208,24 @@ def _keep_bodies(part: Float32) -> None:
         part[:, value] *= ~(mask & ~_largest_body(mask))
 
 
-def _close_apex(part: Float32, tip: int) -> None:
+def _keep_ringed(part: Float32) -> None:
+    """Take from each plane the cavity that has next to no muscle about it, in place.
+
+    What goes on from the plane before it towards the tip stays: up to the valves the ring opens.
+    """
+    before = np.zeros(part.shape[2:], bool)
+    for chance, plane in zip(part, part.argmax(axis=1), strict=True):
+        pieces, count = ndimage.label(plane == CAVITY, np.ones((3, 3), bool))
+        numbers = range(1, count + 1)
+        shares = np.array([_muscle_about(pieces == k, plane) for k in numbers])
+        ring = count > 1 and shares.max() > CLOSED_SHARE
+        goes_on = np.array([before[pieces == k].mean() >= 0.5 for k in numbers], bool)
+        stray = (shares < (STRAY_SHARE if ring else BARE_SHARE)) & ~goes_on
+        before = (pieces > 0) & ~np.isin(pieces, 1 + np.flatnonzero(stray))
+        chance[CAVITY] *= before | (pieces == 0)
+
+
+def _close_apex(part: Float32, tip: int, pixel_mm: float) -> None:
     """Take from the tip of the left ventricle what cannot be it, in place.
 
     Nothing of it lies before plane ``tip``; its cavity ends where muscle no longer surrounds it,
@@ -221,7 +243,8 @@ def _close_apex(part: Float32, tip: int) -> None:
         above = min(number + 1, widest)
         border = labels[number][ndimage.binary_dilation(inside[number]) & ~inside[number]]
         surrounded = inside[number].any() and (border == 0).mean() < OPEN_SHARE
-        leaps = _leaps(float(inside[number].sum()), float(inside[above].sum()))
+        cuts_mm2 = pixel_mm**2 * inside[[number, above]].sum(axis=(1, 2))
+        leaps = _leaps(*cuts_mm2)
         has_cavity = has_cavity and number >= tip and bool(surrounded) and not leaps
         # Nothing but muscle or background lies there: no other chamber reaches the tip.
         if not has_cavity:
@@ -231,31 +254,54 @@ def _close_apex(part: Float32, tip: int) -> None:
             part[number, MUSCLE] *= ~whole[number]
 
 
-def _leaps(cut: float, above: float) -> bool:
+def _leaps(cut_mm2: float, above_mm2: float) -> bool:
     """Whether a body's cut is larger than the neighbouring one by more than anatomy allows."""
-    return cut > LEAP * above + LEAP_PIXELS
+    return cut_mm2 > LEAP * above_mm2 + LEAP_MM2
+
+
+def _hold_cavity(part: Float32, pixel_mm: float) -> None:
+    """Hold the cavity within the ventricle of the rings on both sides where it leaps, in place."""
+    labels = part.argmax(axis=1)
+    cavity = labels == CAVITY
+    ventricle = cavity | (labels == MUSCLE)
+    cuts_mm2 = pixel_mm**2 * cavity.sum(axis=(1, 2))
+    for number, below, above in _between_rings(labels):
+        # An aneurysm, too, may lie between two rings, but widens by degrees.
+        beside = (below + 1, below), (above - 1, above)
+        sudden = any(_leaps(cuts_mm2[near], cuts_mm2[ring]) for near, ring in beside)
+        if sudden and _leaps(cuts_mm2[number], max(cuts_mm2[below], cuts_mm2[above])):
+            part[number, CAVITY] *= ventricle[below] | ventricle[above]
 
 
 def _bridge_cavity(part: Float32) -> None:
     """Give muscle without a cavity the cavity that rings on both sides of it share, in place."""
     labels = part.argmax(axis=1)
     cavity = labels == CAVITY
+    for number, below, above in _between_rings(labels):
+        if not cavity[number].any():
+            shared = cavity[below] & cavity[above] & (part[number].argmax(axis=0) == MUSCLE)
+            _hand_over(part[number], shared, CAVITY)
+
+
+def _between_rings(labels: Integer) -> Iterator[tuple[int, int, int]]:
+    """Planes that show no ring, and for each the next on either side that does."""
     # Bright fat beyond the tip is no ring.
-    held = np.array([k for k, plane in enumerate(labels) if _ringed(plane) > CLOSED_SHARE], int)
-    if not len(held):
-        return
-    for number in np.flatnonzero(~cavity.any(axis=(1, 2))):
-        if not held[0] < number < held[-1]:
-            continue
-        below, above = held[held < number][-1], held[held > number][0]
-        shared = cavity[below] & cavity[above] & (part[number].argmax(axis=0) == MUSCLE)
-        _hand_over(part[number], shared, CAVITY)
+    rings = [k for k, plane in enumerate(labels) if _ringed(plane) > CLOSED_SHARE]
+    for below, above in pairwise(rings):
+        for number in range(below + 1, above):
+            yield number, below, above
 
 
 def _ringed(plane: Label | Integer) -> float:
     """Share of muscle in what the cavity borders on in a plane; 0 where there is no cavity."""
-    cavity = plane == CAVITY
-    border = plane[ndimage.binary_dilation(cavity) & ~cavity]
+    return _muscle_about(plane == CAVITY, plane)
+
+
+def _muscle_about(piece: Mask, plane: Label | Integer) -> float:
+    """Share of muscle in what a piece of a plane borders on; 0 for an empty one."""
+    # Beyond the planes' edge, which is the heart's box, there is no muscle.
+    inside = np.pad(piece, 1)
+    border = np.pad(plane, 1)[ndimage.binary_dilation(inside) & ~inside]
     return float((border == MUSCLE).mean()) if len(border) else 0.0
 
 

@@ -27,8 +27,8 @@ COMPARED_CUT = 0.35
 """The heart on a slice is compared with that on its neighbours where either shows this share of the
 largest cut: the tip comes and goes with the beat."""
 
-COARSE = 2.0
-"""Images are compared on pixels this many times as large: noise and edges matter less."""
+COARSE_MM = 3.0
+"""Images are compared on pixels so large: noise and edges matter less."""
 
 COMPARED = 48
 """Such pixels along each side of what is compared: 144 mm, the heart and what it lies in."""
@@ -128,7 +128,7 @@ def _certainty(found: PlaneProbability, heart: Mask) -> Float:
 
 def _images(cine: Cine, view: View) -> Float32:
     """The heart's surroundings in every image, of mean 0 and norm 1: ``(phase, slice, pixel)``."""
-    coarse = view.varied(scale=COARSE)
+    coarse = view.varied(scale=COARSE_MM / view.pixel_mm)
     first = tuple((side - COMPARED) // 2 for side in view.shape)
     coarse = coarse.cropped((first[0], first[1]), (COMPARED, COMPARED))
     shape = len(cine.intensity), len(view.order)

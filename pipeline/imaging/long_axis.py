@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates, uniform_filter1d
 
 from pipeline.geometry import Float, Float32, Integer, Label, Mask, transform_points
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.view import PIXEL_MM, View
+from pipeline.imaging.view import View
 
 STEP_MM = 1.0
 """Distance of the points along a line of intersection, and of the shifts tried."""
@@ -107,7 +107,7 @@ def find_crossings(cine: Cine, views: Sequence[Cine], view: View, drawn: Label) 
     slices, numbers, offsets_mm, precision = [], [], [], []
     acquired = np.flatnonzero(~np.isin(view.order, cine.interpolated))
     for place, number in enumerate(acquired.tolist()):
-        heart_mm = _heart_mm(drawn[:, number])
+        heart_mm = _heart_mm(drawn[:, number], view.pixel_mm)
         for k, other in enumerate(views):
             line = _line(cine, other, view, number, heart_mm)
             found = None if line is None else _compare(cine, other, line, view.order[number])
@@ -135,10 +135,10 @@ class _Line:
     """``(2, 2)`` rows: along the line and across it, in columns and rows of the slice."""
 
 
-def _heart_mm(drawn: Label) -> Float:
+def _heart_mm(drawn: Label, pixel_mm: float) -> Float:
     """Places ``(n, 2)`` along columns and rows at which a slice shows the heart in any phase."""
     rows, columns = np.nonzero((drawn > 0).any(axis=0))
-    return np.asarray(np.stack([columns, rows], axis=1) * PIXEL_MM, float)
+    return np.asarray(np.stack([columns, rows], axis=1) * pixel_mm, float)
 
 
 def _line(cine: Cine, other: Cine, view: View, number: int, heart_mm: Float) -> _Line | None:

@@ -26,7 +26,7 @@ from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import clear_apex
 from pipeline.imaging.settings import SegmentSettings
-from pipeline.imaging.view import PIXEL_MM, Orientation, View
+from pipeline.imaging.view import Orientation, View
 
 Progress = Callable[[int, int], None]
 
@@ -118,7 +118,7 @@ def segment_cine(
     confidence = slice_confidence(cine, found, seen)
     _require_understood(seen, confidence, found.view, settings)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
-    clean_cycle(found.value)
+    clean_cycle(found.value, found.view.pixel_mm)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
     _require_right_ventricle(drawn)
@@ -209,7 +209,7 @@ def _require_ring(drawn: Label, view: View) -> None:
 def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> None:
     """Refuse a phase that shows no left ventricle to speak of."""
     ventricle = (drawn == LABELS["lv_cavity"]) | (drawn == LABELS["lv_myocardium"])
-    volume_ml = ventricle.sum(axis=(1, 2, 3)) * PIXEL_MM**2 * view.slice_step_mm / 1000
+    volume_ml = ventricle.sum(axis=(1, 2, 3)) * view.pixel_mm**2 * view.slice_step_mm / 1000
     if volume_ml.min() < settings.min_ventricle_ml:
         raise StageError(
             f"phase {volume_ml.argmin()}, slices 0 to {len(view.order) - 1}: no heart found: the "
@@ -251,12 +251,12 @@ def _isotropic(
     shifts_mm = np.zeros((len(acquired), 2))
     if settings.correct_shifts:
         seen = drawn[:, acquired]
-        shifts_mm = slice_shifts_mm(seen, PIXEL_MM, heights_mm, view.axes, crossings)
+        shifts_mm = slice_shifts_mm(seen, view.pixel_mm, heights_mm, view.axes, crossings)
     count = found.planes_a_slice
     planes = (count * acquired[:, None] + np.arange(count)).ravel()
     volume, first_mm = isotropic_labels(
         found.value if len(acquired) == len(view.order) else found.value[:, planes],
-        PIXEL_MM,
+        view.pixel_mm,
         found.plane_mm[planes],
         np.repeat(shifts_mm, count, axis=0),
         # What lies beyond the outer slices is theirs to half a step, planes between included.

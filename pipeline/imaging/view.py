@@ -1,4 +1,4 @@
-"""The stack as the network wants to see it: patient's left to the right, apex first, 1.5 mm.
+"""The stack as the network wants to see it: patient's left to the right, apex first.
 
 Images of any orientation in the patient come out alike, because the file says how the patient
 lies, or, where it says it wrongly, because the heart itself shows it (`Orientation`); so the
@@ -16,7 +16,7 @@ from pipeline.geometry import Float, Float32, Mask
 from pipeline.imaging.cine import Cine
 
 PIXEL_MM = 1.5
-"""Pixel spacing that the network was trained on."""
+"""Pixel spacing in which hearts are sought: that of the blocks of which training images are cut."""
 
 
 def canonical_axes(normal: Float) -> Float:
