@@ -22,7 +22,7 @@ SURROUNDINGS_MM = 30.0
 
 SHOWN_MM = 1.3
 """Pixels in which a heart is labelled, finer than those in which it is sought: of those tried, 1.05
-to 1.7 mm, these did best for right ventricles and muscle (`docs/segmentation-model.md`)."""
+to 1.5 mm, these did best for right ventricles and muscle (`docs/segmentation-model.md`)."""
 
 PIXELS_ACROSS = 80
 """A small heart is labelled in finer pixels still, so many along the longer side of the box that
