@@ -145,10 +145,13 @@ def test_a_right_chamber_taken_for_cavity_leaves_the_rings_below_as_they_are():
 
 def test_a_chamber_beyond_the_base_without_muscle_is_no_cavity():
     heart = rings_with_right_heart([6, 8, 10, 11])
-    # The pulmonary artery, above the right ventricle; and the outflow tract, above the cavity.
-    artery, outflow = np.hypot(X - 17, Y - 32) < 9, np.hypot(X - 36, Y - 32) < 9
-    for beyond, stays in ((artery, False), (outflow, True)):
-        more = np.where(beyond, CAVITY, 0)
+    # The pulmonary artery, above the right ventricle; the outflow tract, above the cavity; and
+    # what has muscle on a fifth of its border.
+    away = np.hypot(X - 17, Y - 32)
+    artery, outflow = away < 9, np.hypot(X - 36, Y - 32) < 9
+    none, some = np.zeros_like(artery), (away >= 9) & (away < 12) & (X > 22)
+    for beyond, wall, stays in ((artery, none, False), (outflow, none, True), (artery, some, True)):
+        more = np.where(beyond, CAVITY, np.where(wall, MUSCLE, 0))
         found = cleaned(np.concatenate([heart, [more, more]]))
         np.testing.assert_array_equal(found[:4], heart)
         np.testing.assert_array_equal(found[4:] == CAVITY, np.stack([beyond & stays] * 2))
@@ -168,13 +171,24 @@ def test_a_cavity_that_leaks_between_two_rings_is_held_within_them():
 
 
 def test_an_aneurysm_that_widens_by_degrees_is_left_as_it_is():
-    rings = [ring(size, size + 6) for size in (8, 14, 14)]
-    # Half of its wall is too thin to be seen, so that no ring is there.
-    bulge = [ring(size, size + 6) for size in (15, 16.5, 18, 16.5, 15)]
+    rings = [ring(size, size + 3) for size in (11, 14, 14)]
+    # Half of its wall is too thin to be seen, so that no ring is there; it lies beyond both rings.
+    bulge = [ring(size, size + 3) for size in (16, 18, 20, 18, 16)]
     bulge = [np.where((X < 32) & (plane == MUSCLE), 0, plane) for plane in bulge]
     heart = np.stack([*rings[:2], *bulge, rings[2]])
     assert (heart[4] == CAVITY).sum() > 1.4 * (heart[1] == CAVITY).sum() + 40
     np.testing.assert_array_equal(cleaned(heart), heart)
+
+
+def test_a_cavity_of_fair_size_beside_one_that_leaks_is_left_as_it_is():
+    aside = np.hypot(X - 36, Y - 32)
+    fair = np.where(aside < 12, CAVITY, np.where((aside < 15) & (X < 34), MUSCLE, 0))
+    wall = (ring(10, 13) == MUSCLE) & (X < 26)
+    leaking = np.where(wall, MUSCLE, np.where(RADIUS < 18, CAVITY, 0))
+    heart = np.stack([ring(9, 12), ring(10, 13), leaking, fair, ring(10, 13)])
+    found = cleaned(heart)
+    np.testing.assert_array_equal(found[2], np.where(RADIUS < 13, leaking, 0))
+    np.testing.assert_array_equal(np.delete(found, 2, 0), np.delete(heart, 2, 0))
 
 
 def test_a_recess_walled_by_muscle_does_not_take_the_open_cavity_beside_it():

@@ -93,7 +93,8 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
 
     The heart is one body and so is each of its structures; what lies enclosed by the heart in a
     plane belongs to it; the tip of the left ventricle is muscle; its cavity is drawn smooth, goes
-    on from plane to plane, and has muscle all around it where it has muscle around most of it.
+    on from plane to plane without leaps, lies by its muscle, and has muscle all around it where it
+    has muscle around most of it.
     Where a structure is ruled out, the next most probable class takes over.
 
     Parameters
@@ -127,8 +128,8 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
     # Beside the body what is less probable than the background stays: it tells where borders lie.
     part[:, 1:] *= ~(whole & ~_largest_body(whole))[:, None]
     part[:, 0] *= ~enclosed
-    # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
     _hold_cavity(part, pixel_mm)
+    # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
     _smooth_cavity(part, pixel_mm)
     _bridge_cavity(part)
     _keep_bodies(part)
