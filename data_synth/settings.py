@@ -23,6 +23,23 @@ Pathology = Literal[
 ]
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which YAML would keep the last and say nothing."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The keys and values of one section."""
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            name, line = str(key.value), key.start_mark.line + 1
+            if name in lines:
+                raise SynthError(
+                    f"{self.name}: line {line}: {name} is given a second time, after line "
+                    f"{lines[name]}; keep one of them"
+                )
+            lines[name] = line
+        return super().construct_mapping(node, deep)
+
+
 class StudyEcgSettings(EcgSettings):
     """The ECG of a study: recorded inside the scanner, unless said otherwise."""
 
@@ -81,8 +98,9 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     content: Any = {}
     if path is not None:
         try:
-            content = yaml.safe_load(path.read_text()) or {}
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            with path.open("rb") as stream:
+                content = yaml.load(stream, _Loader) or {}
+        except (OSError, yaml.YAMLError) as error:
             raise SynthError(f"{path}: cannot be read as YAML settings ({error})") from error
     where = str(path) if path is not None else "settings"
     if not isinstance(content, dict):

@@ -43,6 +43,7 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("pathology: grief", r"pathology.*healthy.*infarct.*enlarged_atrium.*'grief'"),
         ("cine: film", r"cine.*dicom.*enhanced.*nifti"),
         ("colour: red", "colour: unknown key"),
+        ("mr:\n  slices: 8\n  slices: 9", "line 3: slices is given a second time, after line 2"),
         ("mr: {flavour: 1}", r"mr\.flavour: unknown key"),
         ("- 1", "keys and values"),
         ("mr: [", "cannot be read as YAML"),
