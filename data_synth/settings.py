@@ -29,7 +29,7 @@ class _Loader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """The keys and values of one section."""
         lines: dict[str, int] = {}
-        for key, _ in node.value:
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             name, line = str(key.value), key.start_mark.line + 1
             if name in lines:
                 raise SynthError(
@@ -100,6 +100,8 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
         try:
             with path.open("rb") as stream:
                 content = yaml.load(stream, _Loader) or {}
+        except FileNotFoundError as error:
+            raise SynthError(f"{path}: no such file; see configs/phantoms for some") from error
         except (OSError, yaml.YAMLError) as error:
             raise SynthError(f"{path}: cannot be read as YAML settings ({error})") from error
     where = str(path) if path is not None else "settings"

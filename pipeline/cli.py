@@ -116,7 +116,7 @@ def run(
         Run this stage and those after it even if nothing changed: ingest, segment, surface,
         register, bake, evaluate or report.
     until
-        End after this stage.
+        End after this stage, one of the same.
     """
     first, last = _stage_name(from_), _stage_name(until)
     _require_order(first, last)
@@ -230,7 +230,7 @@ def query(
     point
         X Y Z in LPS mm of the MR frame.
     phase
-        Share of the heartbeat since the R peak; only its fraction counts: 1.25 is 0.25.
+        Share of the heartbeat since the R peak, below 10: only its fraction counts, 1.25 is 0.25.
     fixture
         Only this fixture; all of them without it.
     as_json

@@ -16,5 +16,9 @@ class InputError(BeatfieldError):
     exit_code = 2
 
 
+class UnregistrableError(InputError):
+    """Ultrasound that can be read, but shows too little to be registered."""
+
+
 class StageError(BeatfieldError):
     """A stage could not do its work on input that is well formed."""

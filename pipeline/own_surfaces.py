@@ -20,6 +20,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
+from pipeline.field.files import read_metadata
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
 from pipeline.field.metadata import require_name
 from pipeline.field.reader import ForceField
@@ -35,6 +36,10 @@ Transform = tuple[Row, Row, Row, Row]
 
 SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
 """From end to end; a heart in metres or micrometres lies outside."""
+
+SAME_VOLUME, ELSEWHERE_MM = 1e-3, 0.01
+"""Surfaces that differ from those baked by a larger share of volume, or lie farther off, are other
+ones: single precision, in which files may hold them, does less by far."""
 
 NUMBERED = re.compile(r"(?P<structure>.+)_(?P<number>\d+)")
 
@@ -197,16 +202,14 @@ def measure_field(
     Raises
     ------
     InputError
-        When the field cannot be opened, or a surface is missing or has other phases.
+        When the field cannot be opened, or a surface is missing or none of those it was baked from.
     StageError
         When the field is out of the default bounds.
     """
     field = ForceField.open(path)
-    own = read_own_surfaces(folder, field.structures)
-    counts = {name: len(series.phases) for name, series in own.surfaces.items()}
     count = len(field.phases)
-    if any(number != count for number in counts.values()):
-        raise InputError(f"{folder}: surfaces of {counts} phases, {path} has {count}")
+    own = read_own_surfaces(folder, field.structures, count)
+    _require_same_surfaces(folder, own, path, field)
     surfaces = {
         name: SurfaceSeries(series.surfaces, field.phases) for name, series in own.surfaces.items()
     }
@@ -217,8 +220,39 @@ def measure_field(
         BakeSettings().samples,
         lambda: progress(next(done), count) if progress else None,
     )
+    said, found = (
+        max(float(one.get(key, 0)) for key in ("node_error_near_mm", "node_error_far_mm"))
+        for one in (field.accuracy, accuracy)
+    )
+    if found > max(ELSEWHERE_MM, 2 * said):
+        raise InputError(
+            f"{folder}: the surfaces lie up to {found:.2f} mm beside what {path} holds, {said:.1g} "
+            "mm when it was baked; verify needs the very ones that it was baked from"
+        )
     require_bounds(accuracy, Bounds(), min(field.grid.spacing_mm))
     return accuracy
+
+
+def _require_same_surfaces(folder: Path, own: OwnSurfaces, path: Path, field: ForceField) -> None:
+    """Refuse surfaces that the field was not baked from, as far as sizes and places tell."""
+    parts = read_metadata(path).structures
+    wanted = f"verify needs the surfaces that {path} was baked from"
+    for name, series in own.surfaces.items():
+        known = zip(parts[name].triangles, parts[name].volume_ml, strict=True)
+        for index, (surface, (triangles, volume_ml)) in enumerate(
+            zip(series.surfaces, known, strict=True)
+        ):
+            here_ml = surface.volume_mm3() / 1000
+            same = abs(here_ml - volume_ml) <= SAME_VOLUME * volume_ml
+            if len(surface.triangles) != triangles or not same:
+                raise InputError(
+                    f"{folder}: {name}, phase {index}: {len(surface.triangles)} triangles around "
+                    f"{here_ml:.2f} ml, not {triangles} around {volume_ml:.2f} ml; {wanted}"
+                )
+            if not field.contains(surface.vertices_mm).all():
+                raise InputError(
+                    f"{folder}: {name}, phase {index}: reaches out of the field's grid; {wanted}"
+                )
 
 
 def _fixtures_for(surfaces: Collection[str], settings: Settings) -> dict[str, Fixture]:
@@ -238,12 +272,15 @@ def _fixtures_for(surfaces: Collection[str], settings: Settings) -> dict[str, Fi
     }
 
 
-def read_own_surfaces(folder: Path, only: Collection[str] | None = None) -> OwnSurfaces:
+def read_own_surfaces(
+    folder: Path, only: Collection[str] | None = None, phase_count: int | None = None
+) -> OwnSurfaces:
     """Read ``<structure>_000.vtp``, ``<structure>_001.vtp`` ... or ``<structure>/000.vtp`` ...
 
     One file a phase, VTP, STL or PLY, in LPS mm, closed, normals outwards. A structure with a
     single file, numbered or not, does not move. Triangles may differ between phases. With
-    ``only``, those structures are read, and all of them must be there.
+    ``only``, those structures are read, and all of them must be there. ``phase_count`` is that of
+    the longest of them, if it is not known otherwise.
 
     Raises
     ------
@@ -258,11 +295,11 @@ def read_own_surfaces(folder: Path, only: Collection[str] | None = None) -> OwnS
             raise InputError(f"{folder}: has no {', '.join(missing)}; it has {', '.join(files)}")
         files = {name: files[name] for name in only}
     counts = {name: len(paths) for name, paths in files.items()}
-    phase_count = max(counts.values())
+    phase_count = phase_count or max(counts.values())
     odd = [f"{name} has {n}" for name, n in counts.items() if n not in (1, phase_count)]
     if odd:
         raise InputError(
-            f"{folder}: {', '.join(odd)} and another {phase_count} files; every structure needs "
+            f"{folder}: {', '.join(odd)} files, for {phase_count} phases; every structure needs "
             "one a phase, or a single one if it does not move"
         )
     timing = _timing(folder / "phases.json", phase_count)

@@ -125,8 +125,11 @@ def run_study(
         _require_same_study(study, inputs, products)
         run = _Run(study, settings, products, watcher, inputs, _earlier_stages(products))
         for stage in wanted:
+            if stage.name == "register":
+                _require_ultrasound(run, stage, stage.name in forced)
+        for stage in wanted:
             _bring_up_to_date(run, stage, force=stage.name in forced)
-        _note_later_products(run, STAGES[len(wanted) :])
+        _note_standing_products(run, STAGES[len(wanted) :])
         return _record(run, "done")
 
 
@@ -148,18 +151,10 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         run.stages[stage.name] = {"status": "skipped", "cause": str(reason)}
         return
     except BeatfieldError as error:
-        run.stages[stage.name] = {"status": "failed", "cause": str(error)}
-        run.watcher.ended(stage.name, "failed", time.perf_counter() - clock)
-        _record(run, "failed")
+        _fail(run, stage, error, time.perf_counter() - clock)
         # What finished stages noticed may be why this one failed.
         for word, text in remarks(run.stages):
             error.add_note(f"{word}: {text}")
-        later = STAGES[STAGES.index(stage) :]
-        if old := [one.name for one in later if (run.products / one.name).is_dir()]:
-            error.add_note(
-                f"{', '.join(old)} in {run.products} came of an earlier run with other input or "
-                "settings; do not use them for this one"
-            )
         raise
     except KeyboardInterrupt:
         _record(run, "interrupted")
@@ -171,9 +166,42 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     run.watcher.ended(stage.name, "done", seconds)
 
 
-def _note_later_products(run: _Run, later: tuple[Stage, ...]) -> None:
-    """Say of products beyond the last stage asked for whether they still hold."""
-    for stage in later:
+def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
+    """Refuse at once what the stage register would refuse minutes later, if it is to run."""
+    standing = sealed(run.products / register.name)
+    done = standing and standing["fingerprint"] == _fingerprint(run, register) and not force
+    if done or run.study.us is None:
+        return
+    module = importlib.import_module(f"pipeline.stages.{register.name}")
+    clock = time.perf_counter()
+    try:
+        module.require_usable(run.study, run.settings.register_)
+    except InputError as error:
+        _note_standing_products(run, STAGES)
+        run.watcher.started(register.name)
+        _fail(run, register, error, time.perf_counter() - clock)
+        raise
+    except KeyboardInterrupt:
+        _record(run, "interrupted")
+        raise
+
+
+def _fail(run: _Run, stage: Stage, error: BeatfieldError, seconds: float) -> None:
+    """Record that a stage failed, and say what of earlier runs is no longer to be used."""
+    run.stages[stage.name] = {"status": "failed", "cause": str(error)}
+    run.watcher.ended(stage.name, "failed", seconds)
+    _record(run, "failed")
+    later = STAGES[STAGES.index(stage) :]
+    if old := [one.name for one in later if (run.products / one.name).is_dir()]:
+        error.add_note(
+            f"{', '.join(old)} in {run.products} came of an earlier run with other input or "
+            "settings; do not use them for this one"
+        )
+
+
+def _note_standing_products(run: _Run, stages: tuple[Stage, ...]) -> None:
+    """Say of products of stages that were not asked for whether they still hold."""
+    for stage in stages:
         standing = sealed(run.products / stage.name)
         if standing is None:
             continue

@@ -24,6 +24,9 @@ WFDB_ENDINGS = (".hea", ".dat")
 
 PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 
+MEANT = {"us": ("ultrasound", "sweeps"), "ecg": ("ekg", "ecgs")}
+"""Names that a user may give a folder, by the one that is read."""
+
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
@@ -173,6 +176,7 @@ def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
         content["ecg"] = {}
     if "us" not in given and content["us"] is None:
         _require_nothing_in(folder / "us")
+    _require_names_of_folders(folder, given)
     content["cine"] = _found_cine(folder, given.get("cine", {}))
     try:
         described = Described.model_validate(content)
@@ -242,14 +246,32 @@ def _require_no_dicom(cine: Path, image: Path) -> None:
             )
 
 
-def _found_ecg(folder: Path) -> dict[str, Any]:
-    return {name: _record(folder / "ecg" / name) for name in ("mr", "us")}
+def _found_ecg(folder: Path, inside: str = "ecg") -> dict[str, Any]:
+    return {name: _record(folder / inside / name) for name in ("mr", "us")}
 
 
-def _found_us(folder: Path) -> dict[str, Any] | None:
-    found = (folder / "us").glob("*.mh[ad]")
+def _found_us(folder: Path, inside: str = "us") -> dict[str, Any] | None:
+    found = (folder / inside).glob("*.mh[ad]")
     sweeps = tuple(sorted(path for path in found if not path.name.startswith(".")))
     return {"sweeps": sweeps} if sweeps else None
+
+
+def _require_names_of_folders(folder: Path, given: dict[str, Any]) -> None:
+    """Refuse files that would be read but for their folder's name, which is nearly right."""
+
+    def holds(name: str, inside: str) -> bool:
+        found = _found_us(folder, inside) if name == "us" else _found_ecg(folder, inside)
+        return any((found or {}).values())
+
+    for path in sorted(one for one in folder.iterdir() if one.is_dir()):
+        for name, others in MEANT.items():
+            near = path.name != name and path.name.lower() in (name, *others)
+            # Where capitals do not matter, US is us itself.
+            if near and name not in given and holds(name, path.name) and not holds(name, name):
+                raise InputError(
+                    f"{path}: would not be read; rename it to {name}/, or name its files under "
+                    f"{name} in study.yaml (`{name}: null` for none)"
+                )
 
 
 def _require_signals(record: list[Path]) -> None:

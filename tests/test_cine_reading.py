@@ -288,6 +288,17 @@ def test_nifti_without_timing_is_refused(tmp_path: Path) -> None:
         read_nifti_cine(tmp_path / "cine.nii", None)
 
 
+def test_times_without_a_unit_or_in_the_wrong_one_are_told(tmp_path: Path) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=0.15)
+    with pytest.raises(InputError, match=r"RR interval 0\.9 ms, .*as if told in seconds; correct"):
+        read_nifti_cine(tmp_path / "cine.nii", None, rr_ms=0.9)
+    image = nibabel.load(tmp_path / "cine.nii")
+    image.header.set_xyzt_units("mm", "unknown")
+    nibabel.save(image, tmp_path / "other.nii")
+    with pytest.raises(InputError, match=r"a time step of 0\.15 without a unit in its header"):
+        read_nifti_cine(tmp_path / "other.nii", None)
+
+
 @pytest.mark.parametrize("step_s", [None, 1.0, 0.16])
 def test_a_given_rr_interval_spreads_the_phases_evenly(
     tmp_path: Path, step_s: float | None

@@ -5,16 +5,19 @@ import math
 
 import numpy as np
 import pytest
+import pyvista
 from field_baked import FIXTURES, SETTINGS, bake_small
 from field_shapes import box, sphere
 
 from data_synth.population import draw_heart
+from pipeline.config import Settings
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
 from pipeline.field.exact import points_about
 from pipeline.field.store import verify_field
 from pipeline.geometry import MovingSurface, Surface
+from pipeline.own_surfaces import bake_own_surfaces, measure_field
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
 
@@ -131,3 +134,19 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     assert off_mm.max() < 0.1
     assert np.percentile(off_mm, 99) < 0.06
     assert said["drift_max_mm"] == pytest.approx(off_mm.max(), rel=0.5)
+
+
+def test_what_rests_beside_what_moves_is_measured_anew(tmp_path):
+    """A field of a resting surface alone has the phases of those beside it."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    resting = sphere(15, 2)
+    shapes = {"ball": resting, **{f"box_{k:03d}": box((-9,) * 3, (9 + k,) * 3) for k in range(3)}}
+    for name, shape in shapes.items():
+        mesh = pyvista.PolyData.from_regular_faces(shape.vertices_mm, shape.triangles)
+        mesh.save(folder / f"{name}.vtp")
+    fixture = Fixture(structure="ball", kind="guidance", delta_mm=8.0, f_max_n=2.0)
+    settings = Settings(bake=BakeSettings(spacing_mm=3.0, samples=100), fixtures={"hold": fixture})
+    baked = bake_own_surfaces(folder, tmp_path / "out", settings)
+    assert len(ForceField.open(baked).phases) == 3
+    assert measure_field(baked, folder)["sign_errors"] == 0

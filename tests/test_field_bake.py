@@ -301,9 +301,7 @@ def test_surfaces_of_ones_own(folder, tmp_path):
 def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
     """The same figures as at baking; surfaces of another field are refused."""
     baked = bake_own_surfaces(folder, tmp_path / "out", own_settings())
-    said = ForceField.open(baked).accuracy
-
-    measured = measure_field(baked, folder)
+    said, measured = ForceField.open(baked).accuracy, measure_field(baked, folder)
 
     # More samples than at baking, so larger errors may be found, of the same order.
     assert measured["sign_errors"] == 0
@@ -317,8 +315,18 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
         law, most = one["stiffness_n_per_m"], one["stiffness_measured_n_per_m"]
         line = next(line for line in printed.splitlines() if line.startswith(name))
         assert f"{law:.0f} N/m by its law, at most {most:.0f} as measured" in line
+    for way_mm, size, words in (
+        (0.0, 1.01, r"box, phase 0: 12 triangles around .* ml, not 12 around"),
+        (1.0, 1.0, "up to 1.00 mm beside what"),
+        (500.0, 1.0, "box, phase 0: reaches out of the field's grid"),
+    ):
+        other = shutil.copytree(folder, tmp_path / str(way_mm))
+        box_mm = pyvista.read(other / "box_000.vtp").scale(size).translate((way_mm, 0, 0))
+        box_mm.save(other / "box_000.vtp")
+        with pytest.raises(InputError, match=words):
+            measure_field(baked, other)
     (folder / "box_002.ply").unlink()
-    with pytest.raises(InputError, match="has 3"):
+    with pytest.raises(InputError, match="box has 2 files, for 3 phases"):
         measure_field(baked, folder)
     with pytest.raises(InputError, match="has no box"):
         measure_field(baked, folder / "ball")
@@ -366,7 +374,7 @@ def inward_box(folder):
         (lambda f: (f / "box_001.stl").unlink(), "box has 2 files, but none numbered 1"),
         (lambda f: (f / "box_002.ply").write_text("ply\nnothing"), r"box_002\.ply"),
         (lambda f: save(f / "box_000.stl", box((0, 0, 0), (1, 1, 1))), "same structure and phase"),
-        (lambda f: save(f / "ball" / "001.vtp", sphere(5, 2)), "ball has 2 and another 3 files"),
+        (lambda f: save(f / "ball" / "001.vtp", sphere(5, 2)), "ball has 2 files, for 3 phases"),
         (lambda f: save(f / "ball" / "x.vtp", sphere(5, 2)), r"x\.vtp: in a structure's folder"),
         (lambda f: (f / "phases.json").write_text('{"phases": [0, 0.5]}'), "2 phases for 3"),
         (lambda f: (f / "phases.json").write_text('{"phase": []}'), "unknown key"),

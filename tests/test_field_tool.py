@@ -132,7 +132,7 @@ def test_samples_spread_evenly_over_area():
             "line 3: length_mm is given a second time",
         ),
         ("shape: mesh\npath: 7\n", r"mesh\.path: "),
-        ("", r"t\.yaml: \(all\)"),
+        ("", r"t\.yaml: needs keys and values"),
         ("shape: polyline\npoints_mm: []\n", "points_mm"),
     ],
 )

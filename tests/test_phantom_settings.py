@@ -59,6 +59,11 @@ def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):
     assert not (tmp_path / "out").exists()
 
 
+def test_settings_that_are_not_there_are_told(tmp_path):
+    with pytest.raises(SynthError, match=r"none\.yaml: no such file"):
+        read_settings(tmp_path / "none.yaml")
+
+
 def test_flags_lie_over_the_settings_of_the_file(tmp_path, monkeypatch):
     """Each flag reaches the study that is written, and the file holds for the rest."""
     config = tmp_path / "mine.yaml"

@@ -93,6 +93,35 @@ def test_every_stage_publishes_what_the_design_promises(products: Path) -> None:
     assert record["settings"]["bake"]["spacing_mm"] > 0
 
 
+def test_ultrasound_that_cannot_be_used_is_refused_before_it_is_needed(
+    work: Path, tmp_path: Path
+) -> None:
+    study, out = tmp_path / "patient-0009", tmp_path / "out"
+    shutil.copytree(work / "studies" / "patient-0001", study)
+    done("run", study, "--out", out, "--until", "ingest")
+    sweep = min((study / "us").iterdir())
+    whole = sweep.read_bytes()
+    sweep.write_bytes(whole[: len(whole) // 2])
+    # What does not need it is not held up.
+    done("run", study, "--out", out, "--until", "ingest")
+    refused = beatfield("run", study, "--out", out)
+    assert refused.returncode == 2
+    assert sweep.name in refused.stderr
+    assert "earlier run" not in refused.stderr
+    (products,) = (path.parent for path in out.glob("*/run.json"))
+    record = json.loads((products / "run.json").read_text())
+    assert record["status"] == record["stages"]["register"]["status"] == "failed"
+    assert sweep.name in record["stages"]["register"]["cause"]
+    assert record["stages"]["ingest"]["status"] == "done"
+    assert not (products / "segment").exists()
+    sweep.write_bytes(whole)
+    (tmp_path / "more.yaml").write_text("register: {min_frames: 51}\n")
+    refused = beatfield("run", study, "--out", out, "--config", tmp_path / "more.yaml")
+    assert refused.returncode == 2
+    assert "needs 51 or more (register.min_frames)" in refused.stderr
+    assert not (products / "segment").exists()
+
+
 def test_surfaces_are_within_two_millimetres_of_truth_and_closed(products: Path) -> None:
     structures = metrics_of(products)["structures"]
     for name in ("lv_endocardium", "epicardium", "left_atrium"):
@@ -188,6 +217,9 @@ def test_query_and_verify_answer_from_the_shell(products: Path) -> None:
     outside = beatfield("query", store, "--phase", 0, "--point", 999, 0, 0)
     assert outside.returncode == 2
     assert "outside the baked grid" in outside.stderr
+    late = beatfield("query", store, "--phase", 300, "--point", *example["point_mm"])
+    assert late.returncode == 2
+    assert "phase 300: is told in shares of the heartbeat" in late.stderr
     done("verify", store)
 
 

@@ -23,7 +23,7 @@ from ellipsoid_heart import (
 from data_synth.ecg import simulate_ecg
 from data_synth.population import draw_heart
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
-from pipeline.errors import InputError, StageError
+from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import MovingSurface
 from pipeline.job import Skipped
 from pipeline.registration import space
@@ -222,7 +222,10 @@ class TestRefusals:
             register(recording.sweeps, recording.phases, surfaces, columns, QUICK)
 
     @pytest.mark.parametrize("on_failure", ["stop", "mr_frame"])
-    @pytest.mark.parametrize("wrong", [InputError("none crosses"), StageError("no pose")])
+    @pytest.mark.parametrize(
+        "wrong",
+        [InputError("not numbers"), UnregistrableError("none crosses"), StageError("no pose")],
+    )
     def test_a_stage_that_fails_says_what_its_transforms_look_like(
         self, monkeypatch, recording, wrong, on_failure
     ):
@@ -240,13 +243,24 @@ class TestRefusals:
         near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
         poses = recording.sweeps[0].tracker_from_image
         sweeps = [SimpleNamespace(tracker_from_image=poses, tracker_from_probe=near)]
-        stop = isinstance(wrong, InputError) or on_failure == "stop"
+        stop = type(wrong) is InputError or on_failure == "stop"
         with pytest.raises(type(wrong) if stop else Skipped, match=f"{wrong}; .*in metres"):
             stage._registered(job, sweeps, timing, {}, None)
         sweeps[0].tracker_from_probe = 1000 * near
         with pytest.raises(type(wrong) if stop else Skipped) as told:
             stage._registered(job, sweeps, timing, {}, None)
         assert "metres" not in str(told.value)
+
+    def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
+        sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))
+        monkeypatch.setattr(stage, "read_sweep", lambda _: sweep)
+        monkeypatch.setattr(stage, "_r_times_s", lambda _: None)
+        timing = SimpleNamespace(phases=lambda: [np.zeros(4)])
+        monkeypatch.setattr(stage, "_timing", lambda *_: timing)
+        study = SimpleNamespace(us=SimpleNamespace(sweeps=("a",)))
+        with pytest.raises(UnregistrableError, match=r"hold 4 frames.*10 or more \(register"):
+            stage.require_usable(study, RegisterSettings())
+        stage.require_usable(study, RegisterSettings(on_failure="mr_frame"))
 
     def test_start_must_be_rigid(self, surfaces, recording):
         scaled = np.diag([1.1, 1.1, 1.1, 1.0]) @ recording.mr_from_tracker

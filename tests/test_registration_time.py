@@ -230,7 +230,7 @@ def test_times_of_another_clock_are_told(times, r_times_s, words):
     files = SimpleNamespace(us=SimpleNamespace(sweeps=(sweep,)), ecg=SimpleNamespace(us=ecg))
     sweeps = [SimpleNamespace(times_s=times)]
     with pytest.raises(InputError) as told:
-        _timing(SimpleNamespace(study=files), sweeps, r_times_s, None)
+        _timing(files, sweeps, r_times_s, None)
     said = str(told.value)
     assert said.startswith("us/fan.mha, beside ecg/us: ")
     assert said.partition("on the same clock?")[2].startswith(words)
@@ -240,7 +240,7 @@ def test_times_of_another_clock_are_told(times, r_times_s, words):
 def test_times_that_the_ecg_covers_are_taken():
     files = SimpleNamespace(us=SimpleNamespace(sweeps=("a", "b")), ecg=SimpleNamespace(us="ecg"))
     sweeps = [SimpleNamespace(times_s=np.arange(5.0) + one) for one in (2.0, 20.0)]
-    timing = _timing(SimpleNamespace(study=files), sweeps, R_TIMES_S, 0.8)
+    timing = _timing(files, sweeps, R_TIMES_S, 0.8)
     assert [len(phases) for phases in timing.phases()] == [5, 5]
 
 

@@ -80,6 +80,13 @@ def test_a_name_that_is_a_folder_is_told(ecg, tmp_path, capsys):
     assert not (tmp_path.parent / f".{tmp_path.name}.part").exists()
 
 
+def test_a_folder_of_records_is_told_what_it_holds(ecg, tmp_path, capsys):
+    write_wfdb(tmp_path, "mr", ecg)
+    write_wfdb(tmp_path, "us", ecg)
+    assert main(["rpeaks", str(tmp_path), "--out", str(tmp_path / "p.csv")]) == 2
+    assert f"{tmp_path}: is a folder; name one ECG in it: mr.hea, us.hea" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("record", "out", "words"),
     [("none", "p.csv", "no such ECG"), ("rec", "nowhere/p.csv", "cannot be written")],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import nibabel
@@ -151,6 +152,29 @@ def test_signals_that_a_wfdb_header_names_are_looked_for(tmp_path: Path, there: 
     else:
         with pytest.raises(InputError, match=r"us\.hea: names other\.dat, which is not beside it"):
             open_study(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "right"), [("ultrasound", "us"), ("US", "us"), ("ECG", "ecg"), ("ekg", "ecg")]
+)
+def test_a_folder_whose_name_is_nearly_right_is_told(tmp_path: Path, name: str, right: str) -> None:
+    folder = study_folder(tmp_path)
+    # In two steps, for file systems to which US and us are one.
+    (folder / right).rename(folder / "moved")
+    (folder / "moved").rename(folder / name)
+    if not (folder / right).exists():
+        with pytest.raises(InputError, match=rf"{name}: would not be read; rename it to {right}/"):
+            open_study(folder)
+        (folder / right).mkdir()
+        with pytest.raises(InputError, match=rf"{name}: would not be read"):
+            open_study(folder)
+    (folder / "study.yaml").write_text("us: null\necg: null\n")
+    assert open_study(folder).us is None
+    (folder / "study.yaml").unlink()
+    shutil.rmtree(folder / name)
+    (folder / "sweeps").mkdir()
+    study_folder(tmp_path)
+    assert open_study(folder).us is not None
 
 
 @pytest.mark.parametrize("name", ["us/sweep.nrrd", "us/left/sweep.mha", "us/sweep.MHA"])

@@ -8,7 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.errors import InputError
 from pipeline.field.reader import ForceField
+
+MOST_BEATS = 10
+"""Nobody asks for a phase so many heartbeats away, but many a one for 300 milliseconds."""
 
 
 def query_point(
@@ -23,7 +27,8 @@ def query_point(
     point_mm
         ``(x, y, z)``, LPS mm of the MR frame.
     phase
-        Share of the heartbeat since the R peak; only its fraction counts.
+        Share of the heartbeat since the R peak; only its fraction counts. From ten heartbeats on
+        it is taken for milliseconds, and refused.
     fixture
         Name of the only one to ask; all of them when None.
 
@@ -40,9 +45,14 @@ def query_point(
     ------
     InputError
         When the field cannot be read, is damaged or has a fixture that its device cannot render,
-        the fixture is unknown or a number is not finite.
+        the fixture is unknown, a number is not finite or the phase ten heartbeats away.
     """
     field = ForceField.open(path)
+    if MOST_BEATS <= abs(phase) < np.inf:
+        raise InputError(
+            f"phase {phase:g}: is told in shares of the heartbeat, such as 0.35, not in "
+            "milliseconds; divide the time since the R peak by the RR interval"
+        )
     points = [point_mm]
     if fixture is not None:
         field.potential(points, phase, fixture)

@@ -184,8 +184,11 @@ def read_tool(path: Path | str) -> Tool:
     from pipeline.yaml_files import read_yaml
 
     path = Path(path)
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: needs keys and values, such as `shape: needle`")
     try:
-        tool: Tool = TypeAdapter(Tool).validate_python(read_yaml(path))
+        tool: Tool = TypeAdapter(Tool).validate_python(content)
     except ValidationError as error:
         raise InputError(describe_validation(error, str(path))) from error
     if isinstance(tool, Mesh):

@@ -165,9 +165,10 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     low_ms, high_ms = (1000 * limit for limit in PLAUSIBLE_RR_S)
     if not ((rr_ms > low_ms) & (rr_ms < high_ms)).all():
         worst = rr_ms[np.argmax(np.abs(np.log(np.maximum(rr_ms, 1e-6) / 900)))]
+        seconds = " it looks as if told in seconds;" if low_ms < 1000 * worst < high_ms else ""
         raise InputError(
-            f"{where}: RR interval {worst:g} ms, a heartbeat lasts {low_ms:g} to {high_ms:g} ms; "
-            "correct the timing, or give cine.rr_ms in study.yaml"
+            f"{where}: RR interval {worst:g} ms, a heartbeat lasts {low_ms:g} to {high_ms:g} ms;"
+            f"{seconds} correct the timing, or cine.rr_ms in study.yaml, which goes before it"
         )
     phases = trigger_times_ms / rr_ms[:, None]
     if phases.min() < 0 or phases.max() >= 1:

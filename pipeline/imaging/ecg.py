@@ -63,6 +63,11 @@ def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
     header = path.with_suffix(".hea") if path.suffix == ".dat" else Path(f"{path}.hea")
     if path.suffix == ".hea" or header.is_file():
         ecg = _read_wfdb(path if path.suffix == ".hea" else header, gaps)
+    elif path.is_dir():
+        inside = sorted(one.name for end in ("hea", "csv", "dcm") for one in path.glob(f"*.{end}"))
+        raise InputError(
+            f"{path}: is a folder; name one ECG in it: {', '.join(inside) or 'there is none'}"
+        )
     elif not path.is_file():
         raise InputError(
             f"{path}: no such ECG; neither this file nor {header.name} exists; name a WFDB record, "

@@ -246,10 +246,13 @@ def _timing(
 def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
     """One heartbeat of evenly spread phases, as the header's time step tells it."""
     unit = image.header.get_xyzt_units()[1]
-    step_ms = 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
+    step = float(image.header.get_zooms()[3])
+    step_ms = 1000 * step * SECONDS_PER_UNIT.get(unit, 0.0)
     if not step_ms > 0:
+        told = "without a unit" if unit == "unknown" else f"in {unit}"
+        in_header = f"a time step of {step:g} {told} in" if step > 0 else "no time step in"
         raise InputError(
-            f"{path}: has no trigger times: no timing file beside it and no time step in its "
+            f"{path}: has no trigger times: no timing file beside it and {in_header} its "
             'header; write timing.json with "trigger_times_ms" and "rr_ms" beside it, or, for '
             "phases evenly spread over the beat, give cine.rr_ms in study.yaml"
         )

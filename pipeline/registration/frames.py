@@ -11,7 +11,7 @@ from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.sparse import csr_array
 from scipy.stats import rankdata
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, UnregistrableError
 from pipeline.geometry import Float, Float32, Integer, Mask
 from pipeline.registration.contact import Contact
 
@@ -127,7 +127,7 @@ def sample_frames(
         parts.append(replace(part, number=part.number + offset))
         offset += len(own)
     if not any(part.frames for part in parts):
-        raise InputError(
+        raise UnregistrableError(
             f"none of the {offset} frames shows a body and has a finite pose: all are flat or were "
             "taken in air; was the probe in contact?"
         )
@@ -256,7 +256,7 @@ def _sector(sweep: TrackedSweep) -> Mask:
     shown = np.isfinite(sweep.images).all(axis=0) & (sweep.images.max(axis=0) > 0)
     sector = binary_fill_holes(binary_closing(shown, iterations=3) | shown)
     if sector is None or sector.mean() < 0.02:
-        raise InputError(
+        raise UnregistrableError(
             f"{sweep.name}: only {shown.mean():.1%} of the pixels ever show anything; "
             "needs grey values with a sector in view"
         )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import InputError, StageError
+from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
 from pipeline.registration.breathing import follow_breath
@@ -196,7 +196,7 @@ def find(
     tell = progress or (lambda done, total: None)
     if start is not None:
         require_rigid(start, "initial mr_from_tracker")
-    _require_frames(sweeps, phases, settings)
+    require_frames(sweeps, phases, settings)
     lacking = [name for name in BLOOD if name not in surfaces]
     if lacking:
         wider_mm = settings.model_error_mm * (1 + _LACKING * len(lacking))
@@ -230,7 +230,7 @@ def find(
     return result
 
 
-def _require_frames(
+def require_frames(
     sweeps: Sequence[TrackedSweep], phases: Sequence[Float], settings: RegisterSettings
 ) -> None:
     """Refuse fewer frames than are needed."""
@@ -238,9 +238,9 @@ def _require_frames(
         raise InputError(f"{len(sweeps)} sweeps came with phases for {len(phases)}")
     frames = sum(len(sweep.images) for sweep in sweeps)
     if frames < settings.min_frames:
-        raise InputError(
-            f"{len(sweeps)} sweeps hold {frames} frames; registration needs "
-            f"{settings.min_frames} or more: record a longer sweep"
+        raise UnregistrableError(
+            f"{len(sweeps)} sweeps hold {frames} frames; registration needs {settings.min_frames} "
+            "or more (register.min_frames): add sweeps, or write `us: null` in study.yaml"
         )
 
 
@@ -252,10 +252,11 @@ def _require_heart_in_view(level: Level, search: Search) -> None:
     needed, seen = max(1, min(settings.min_frames, frames)), _most_in_view(level, search)
     if seen < needed:
         inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
-        raise InputError(
+        inverted = _most_in_view(level, inverse) >= needed
+        raise (InputError if inverted else UnregistrableError)(
             f"of {frames} frames looked at, {seen} or fewer cross the heart at every pose within "
             f"{settings.capture_mm:g} mm and {settings.capture_deg:g} degrees of the start; "
-            + (_INVERTED if _most_in_view(level, inverse) >= needed else _MISPLACED)
+            + (_INVERTED if inverted else _MISPLACED)
         )
 
 

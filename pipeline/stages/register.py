@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import InputError, StageError
+from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweep
@@ -20,8 +20,14 @@ from pipeline.products import (
     write_table,
 )
 from pipeline.registration.clock_offset import Timing
-from pipeline.registration.space import Registration, register
+from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.space import (
+    Registration,
+    register,
+    require_frames,
+)
 from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
+from pipeline.study import Study
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -30,10 +36,10 @@ def run(job: Job) -> dict[str, Any]:
         raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
     start = _start(job)
     sweeps = [read_sweep(path) for path in job.study.us.sweeps]
-    r_times_s = _r_times_s(job)
+    r_times_s = _r_times_s(job.study)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
-    timing = _timing(job, sweeps, r_times_s, cycle.get("rr_s"))
+    timing = _timing(job.study, sweeps, r_times_s, cycle.get("rr_s"))
     found = _registered(job, sweeps, timing, surfaces, start)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found))
@@ -52,6 +58,22 @@ def run(job: Job) -> dict[str, Any]:
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
         **_clock_figures(found),
     }
+
+
+def require_usable(study: Study, settings: RegisterSettings) -> None:
+    """Refuse at once what `run` would refuse of the ultrasound's files minutes later.
+
+    Raises
+    ------
+    InputError
+        When a sweep or its ECG cannot be read, they do not overlap, or frames are too few.
+    """
+    if study.us is None:
+        return
+    sweeps = [read_sweep(path) for path in study.us.sweeps]
+    timing = _timing(study, sweeps, _r_times_s(study), None)
+    if settings.on_failure == "stop":
+        require_frames(sweeps, timing.phases(), settings)
 
 
 def _start(job: Job) -> Float | None:
@@ -76,29 +98,32 @@ def _registered(
     except (InputError, StageError) as error:
         odd = odd_transforms(sweeps)
         said = type(error)(f"{error}; {odd}") if odd else error
-        if isinstance(error, InputError) or settings.on_failure == "stop":
+        malformed = isinstance(error, InputError) and not isinstance(error, UnregistrableError)
+        if malformed or settings.on_failure == "stop":
             raise said from error.__cause__
         raise Skipped(f"{said}; the field is in the frame of the MR") from error
 
 
-def _timing(job: Job, sweeps: list[Sweep], r_times_s: Float, cycle_rr_s: float | None) -> Timing:
+def _timing(
+    study: Study, sweeps: list[Sweep], r_times_s: Float, cycle_rr_s: float | None
+) -> Timing:
     """When frames were taken; each sweep must lie within its ECG."""
-    assert job.study.us is not None, "only a study with ultrasound is registered"
-    for path, sweep in zip(job.study.us.sweeps, sweeps, strict=True):
+    assert study.us is not None, "only a study with ultrasound is registered"
+    for path, sweep in zip(study.us.sweeps, sweeps, strict=True):
         try:
             phases_at(sweep.times_s, r_times_s, cycle_rr_s)
         except InputError as error:
-            raise InputError(f"{path}, beside {job.study.ecg.us}: {error}") from error
+            raise InputError(f"{path}, beside {study.ecg.us}: {error}") from error
     return Timing([sweep.times_s for sweep in sweeps], r_times_s, cycle_rr_s)
 
 
-def _r_times_s(job: Job) -> Float:
-    assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
-    ecg = read_ecg(job.study.ecg.us)
+def _r_times_s(study: Study) -> Float:
+    assert study.ecg.us is not None, "a study with ultrasound has its ECG"
+    ecg = read_ecg(study.ecg.us)
     try:
         return detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz) + ecg.start_s
     except InputError as error:
-        raise InputError(f"{job.study.ecg.us}: {error}") from error
+        raise InputError(f"{study.ecg.us}: {error}") from error
 
 
 def _rows(sweeps: list[Sweep], phases: list[Float], found: Registration) -> list[FrameRow]:
