@@ -176,8 +176,8 @@ def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
     clock = time.perf_counter()
     try:
         module.require_usable(run.study, run.settings.register_)
-    except InputError as error:
-        _note_standing_products(run, STAGES)
+    except BeatfieldError as error:
+        _note_standing_products(run, STAGES[: STAGES.index(register)])
         run.watcher.started(register.name)
         _fail(run, register, error, time.perf_counter() - clock)
         raise

@@ -113,6 +113,7 @@ def test_ultrasound_that_cannot_be_used_is_refused_before_it_is_needed(
     assert record["status"] == record["stages"]["register"]["status"] == "failed"
     assert sweep.name in record["stages"]["register"]["cause"]
     assert record["stages"]["ingest"]["status"] == "done"
+    assert set(record["stages"]) == {"ingest", "register"}
     assert not (products / "segment").exists()
     sweep.write_bytes(whole)
     (tmp_path / "more.yaml").write_text("register: {min_frames: 51}\n")

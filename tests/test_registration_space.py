@@ -23,6 +23,7 @@ from ellipsoid_heart import (
 from data_synth.ecg import simulate_ecg
 from data_synth.population import draw_heart
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
+from pipeline import run as runner
 from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import MovingSurface
 from pipeline.job import Skipped
@@ -261,6 +262,29 @@ class TestRefusals:
         with pytest.raises(UnregistrableError, match=r"hold 4 frames.*10 or more \(register"):
             stage.require_usable(study, RegisterSettings())
         stage.require_usable(study, RegisterSettings(on_failure="mr_frame"))
+
+    @pytest.mark.parametrize(
+        ("made", "force", "us", "looked_at"),
+        [
+            ("now", False, "a sweep", False),
+            ("now", True, "a sweep", True),
+            ("before", False, "a sweep", True),
+            (None, False, "a sweep", True),
+            (None, False, None, False),
+        ],
+    )
+    def test_ultrasound_is_looked_at_first_only_where_it_will_be_registered(
+        self, monkeypatch, made, force, us, looked_at
+    ):
+        seen = []
+        monkeypatch.setattr(runner, "sealed", lambda _: made and {"fingerprint": made})
+        monkeypatch.setattr(runner, "_fingerprint", lambda *_: "now")
+        monkeypatch.setattr(stage, "require_usable", lambda study, _: seen.append(study.us))
+        run = SimpleNamespace(
+            products=Path(), study=SimpleNamespace(us=us), settings=SimpleNamespace(register_=None)
+        )
+        runner._require_ultrasound(run, runner.Stage("register"), force)
+        assert bool(seen) == looked_at
 
     def test_start_must_be_rigid(self, surfaces, recording):
         scaled = np.diag([1.1, 1.1, 1.1, 1.0]) @ recording.mr_from_tracker

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,13 +21,12 @@ from pipeline.products import (
 )
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.space import (
-    Registration,
-    register,
-    require_frames,
-)
+from pipeline.registration.space import Registration, register, require_frames
 from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
-from pipeline.study import Study
+
+if TYPE_CHECKING:
+    # For types only: a stage's product must not depend on how a study's folder is understood.
+    from pipeline.study import Study
 
 
 def run(job: Job) -> dict[str, Any]:
