@@ -47,6 +47,7 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("mr: {flavour: 1}", r"mr\.flavour: unknown key"),
         ("- 1", "keys and values"),
         ("mr: [", "cannot be read as YAML"),
+        ("mr: !!map foo", "cannot be read as YAML"),
     ],
 )
 def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):

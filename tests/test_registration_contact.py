@@ -13,7 +13,7 @@ from data_synth.echo import silence
 from data_synth.population import draw_heart
 from data_synth.probe import PROBES
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
-from pipeline.errors import InputError
+from pipeline.errors import UnregistrableError
 from pipeline.registration.contact import Contact
 from pipeline.registration.frames import sample_frames
 
@@ -99,5 +99,5 @@ def test_a_study_all_in_air_is_refused(recording):
         replace(sweep, images=np.stack([in_air(rng, sector) for _ in sweep.images]))
         for sweep in recording.sweeps
     ]
-    with pytest.raises(InputError, match="none of the 16 frames shows a body"):
+    with pytest.raises(UnregistrableError, match="none of the 16 frames shows a body"):
         sample_frames(sweeps, recording.phases, *LENGTHS_MM)

@@ -209,13 +209,15 @@ class TestRefusals:
 
     def test_start_that_looks_past_the_heart_is_refused(self, surfaces, recording):
         away = start_off(recording, 0, 400, 0)
-        with pytest.raises(InputError, match=r"cross the heart.*directions.*ImageToProbe.*units"):
+        words = r"cross the heart.*directions.*ImageToProbe.*units"
+        with pytest.raises(UnregistrableError, match=words):
             register(recording.sweeps, recording.phases, surfaces, away, QUICK)
 
     def test_start_that_is_given_the_other_way_round_is_told(self, surfaces, recording):
         inverse = np.linalg.inv(start_off(recording, 0, 5, 5))
-        with pytest.raises(InputError, match=r"cross the heart.*by its inverse they do"):
+        with pytest.raises(InputError, match=r"cross the heart.*by its inverse they do") as told:
             register(recording.sweeps, recording.phases, surfaces, inverse, QUICK)
+        assert not isinstance(told.value, UnregistrableError)
 
     def test_start_in_columns_is_told(self, surfaces, recording):
         columns = recording.mr_from_tracker.T
@@ -312,8 +314,10 @@ class TestRefusals:
     )
     def test_sweeps_that_make_no_sense_are_named(self, surfaces, recording, change, message):
         broken = [replace(recording.sweeps[0], **change), recording.sweeps[1]]
-        with pytest.raises(InputError, match=f"sweep_000: .*{message}"):
+        with pytest.raises(InputError, match=f"sweep_000: .*{message}") as told:
             register(broken, recording.phases, surfaces, recording.mr_from_tracker, QUICK)
+        # What the pictures do not show is no fault of the files.
+        assert isinstance(told.value, UnregistrableError) == ("images" in change)
 
     def test_phases_must_belong_to_the_frames(self, surfaces, recording):
         sweeps, pose = recording.sweeps, recording.mr_from_tracker
