@@ -15,12 +15,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
+from pipeline.study_files import files_below, names_in_header, record_files, sweep_files
 from pipeline.validation import describe_validation
 from pipeline.yaml_files import read_yaml
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 DICOM_ENDINGS = (".dcm", ".ima", "")
-WFDB_ENDINGS = (".hea", ".dat")
+SWEEP_ENDINGS = (".mha", ".mhd")
 
 PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 
@@ -91,15 +92,16 @@ class Study(Described):
 
     def input_files(self) -> dict[str, list[Path]]:
         """Every file that a stage may read, by kind: cine, mr_ecg, us, truth."""
-        us = _record_files(self.ecg.us) + (list(self.us.sweeps) if self.us else [])
-        cine = _files(self.cine.path) + ([self.cine.timing] if self.cine.timing else [])
+        sweeps = [one for path in (self.us.sweeps if self.us else ()) for one in sweep_files(path)]
+        us = record_files(self.ecg.us) + sweeps
+        cine = files_below(self.cine.path) + ([self.cine.timing] if self.cine.timing else [])
         if self.long_axis.is_dir() and not self.cine.path.is_dir():
-            cine += _files(self.long_axis)
+            cine += files_below(self.long_axis)
         return {
             "cine": cine,
-            "mr_ecg": _record_files(self.ecg.mr),
+            "mr_ecg": record_files(self.ecg.mr),
             "us": us,
-            "truth": _files(self.truth) if self.truth else [],
+            "truth": files_below(self.truth) if self.truth else [],
         }
 
 
@@ -174,8 +176,8 @@ def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
         content[name] = _overridden(found, given[name]) if name in given else found
     if content["ecg"] is None:
         content["ecg"] = {}
-    if "us" not in given and content["us"] is None:
-        _require_nothing_in(folder / "us")
+    if "us" not in given:
+        _require_no_other_sweep(folder / "us", content["us"])
     _require_names_of_folders(folder, given)
     content["cine"] = _found_cine(folder, given.get("cine", {}))
     try:
@@ -217,7 +219,7 @@ def _found_cine(folder: Path, given: Any) -> Any:
     if not isinstance(path, str):
         return given
     cine = folder / path
-    images = [one for one in _files(cine) if one.name.lower().endswith(NIFTI_ENDINGS)]
+    images = [one for one in files_below(cine) if one.name.lower().endswith(NIFTI_ENDINGS)]
     if len(images) > 1:
         raise InputError(
             f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}), one 4D "
@@ -238,7 +240,7 @@ def _found_cine(folder: Path, given: Any) -> Any:
 
 def _require_no_dicom(cine: Path, image: Path) -> None:
     """Refuse a folder in which one NIfTI file would stand for what may be another cine."""
-    for one in _files(cine):
+    for one in files_below(cine):
         if one.suffix.lower() in DICOM_ENDINGS:
             raise InputError(
                 f"{cine}: holds {image.name}, a NIfTI file, and {one.name}, as of DICOM; keep "
@@ -251,8 +253,8 @@ def _found_ecg(folder: Path, inside: str = "ecg") -> dict[str, Any]:
 
 
 def _found_us(folder: Path, inside: str = "us") -> dict[str, Any] | None:
-    found = (folder / inside).glob("*.mh[ad]")
-    sweeps = tuple(sorted(path for path in found if not path.name.startswith(".")))
+    beside = (one for one in files_below(folder / inside) if one.parent == folder / inside)
+    sweeps = tuple(one for one in beside if one.suffix.lower() in SWEEP_ENDINGS)
     return {"sweeps": sweeps} if sweeps else None
 
 
@@ -275,29 +277,24 @@ def _require_names_of_folders(folder: Path, given: dict[str, Any]) -> None:
 
 
 def _require_signals(record: list[Path]) -> None:
-    """Refuse a WFDB header whose signals are not beside it."""
+    """Refuse a WFDB header whose signals, or whose segments' headers, are not beside it."""
     for header in (one for one in record if one.suffix == ".hea"):
-        try:
-            lines = header.read_text(errors="replace").splitlines()
-        except OSError as error:
-            raise InputError(f"{header}: cannot be read ({error})") from error
-        named = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]
-        # The first line names the record: as name/n where n segments have headers of their own.
-        files = named[1:] if named and "/" not in named[0] else []
-        missing = [name for name in files if not (header.parent / name).exists()]
-        if missing:
-            raise InputError(f"{header}: names {missing[0]}, which is not beside it; copy it there")
+        for name in names_in_header(header):
+            beside = header.parent / name
+            if not beside.exists() and not beside.with_name(f"{name}.hea").exists():
+                raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
 
 
-def _require_nothing_in(us: Path) -> None:
+def _require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
     """Refuse files that a user took for sweeps, and that nothing would read."""
-    others = _files(us)
-    if others:
-        raise InputError(
-            f"{us}: holds no sweep but {others[0].name}; sweeps are .mha or .mhd files directly in "
-            "this folder: convert or move them, name them under us.sweeps in study.yaml, or write "
-            "`us: null` there"
-        )
+    taken = found["sweeps"] if found else ()
+    for one in files_below(us):
+        if found is None or (one.suffix.lower() in SWEEP_ENDINGS and one not in taken):
+            raise InputError(
+                f"{us}: {one.relative_to(us)} would not be read; sweeps are .mha or .mhd files "
+                "directly in this folder: convert, move or remove it, name all sweeps under "
+                "us.sweeps in study.yaml, or write `us: null` there"
+            )
 
 
 def _record(stem: Path) -> Path | None:
@@ -306,12 +303,6 @@ def _record(stem: Path) -> Path | None:
     return next(
         (stem.with_suffix(end) for end in (".csv", ".dcm") if stem.with_suffix(end).exists()), None
     )
-
-
-def _record_files(stem: Path | None) -> list[Path]:
-    if stem is not None and stem.suffix in WFDB_ENDINGS:
-        stem = stem.with_suffix("")
-    return [] if stem is None else sorted(stem.parent.glob(stem.name + "*"))
 
 
 def _require_files(study: Study) -> None:
@@ -324,15 +315,15 @@ def _require_files(study: Study) -> None:
     for path in missing:
         if path is not None and not path.exists():
             raise InputError(f"{study.folder}: {path} does not exist; study.yaml names it")
-    if not _files(study.cine.path):
+    if not files_below(study.cine.path):
         raise InputError(
             f"{study.cine.path}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file"
         )
     _require_what_fits_the_cine(study)
     for stem in (study.ecg.mr, study.ecg.us):
-        if stem is not None and not _record_files(stem):
+        if stem is not None and not record_files(stem):
             raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
-        _require_signals([one for one in _record_files(stem) if stem and one.stem == stem.stem])
+        _require_signals([one for one in record_files(stem) if stem and one.stem == stem.stem])
     if study.us and study.ecg.us is None:
         raise InputError(
             f"{study.folder}: has tracked ultrasound but no ECG recorded with it; add ecg/us.hea "
@@ -362,16 +353,8 @@ def _require_what_fits_the_cine(study: Study) -> None:
             f"{described}: cine.timing: applies to NIfTI only, and {cine.path} is a folder of "
             "DICOM files, which tell their own times; take the key out, or give cine.rr_ms"
         )
-    if cine.path.is_dir() and _files(study.long_axis):
+    if cine.path.is_dir() and files_below(study.long_axis):
         raise InputError(
             f"{study.long_axis}: is read beside a NIfTI cine only, and {cine.path} is a folder of "
             "DICOM files; put DICOM files of the views there, or take this folder out"
         )
-
-
-def _files(path: Path) -> list[Path]:
-    """A file, or all in a folder but those whose names begin with a dot, which systems leave."""
-    if path.is_dir():
-        found = path.rglob("*")
-        return sorted(one for one in found if one.is_file() and not one.name.startswith("."))
-    return [path] if path.is_file() else []

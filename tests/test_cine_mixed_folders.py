@@ -142,7 +142,7 @@ def stills() -> list[FileDataset]:
         (finer, ['series 9 "more of the same": 15 images', "has already, 12 x 16 pixels"]),
         (lambda: of_type("DERIVED", "SECONDARY", "MPR"), ["20 images", "derived images, slices"]),
         (lambda: of_type("ORIGINAL", "PRIMARY", "P"), ["20 images", "phase images, slices"]),
-        (stills, ['series 9 "late enhancement": 4 images', "one moment of a slice"]),
+        (stills, ['series 9 "late enhancement": 4 images', "one moment of the beat"]),
         (
             lambda: other_cine(lambda data: None),
             ["series 1 ", "series 4 ", "5 images", 'a copy of series 9 "more'],

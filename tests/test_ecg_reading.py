@@ -110,6 +110,17 @@ def test_wfdb_units_become_millivolts(tmp_path, unit, millivolts):
     np.testing.assert_allclose(read_ecg(stem).signal_mv, expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("sign", ["\xb5V".encode("latin-1"), "\xb5V".encode(), "\u03bcV".encode()])
+def test_a_micro_sign_is_told_before_microvolts_are_taken_for_volts(tmp_path, sign):
+    stem = write_wfdb(tmp_path, units="uV")
+    header = stem.with_name(stem.name + ".hea")
+    header.write_bytes(header.read_bytes().replace(b"uV", sign))
+    with pytest.raises(InputError, match=r"micro sign.*write uV"):
+        read_ecg(stem)
+    header.write_bytes(header.read_bytes().replace(sign, b"uV") + b"# by M\xc3\xb5ller\n")
+    np.testing.assert_allclose(read_ecg(stem).signal_mv, STEPS_UV / 1e6, rtol=1e-9)
+
+
 def test_csv_starts_at_its_first_time(tmp_path):
     path = write_csv(tmp_path / "ecg.csv", times_s=12.5 + np.arange(1000) / RATE_HZ)
     ecg = read_ecg(path)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from pipeline.errors import InputError
 from pipeline.study import EcgFiles, open_study
+from pipeline.study_files import files_below
 
 
 def study_folder(root: Path, *, us: bool = True) -> Path:
@@ -164,17 +168,83 @@ def test_a_folder_whose_name_is_nearly_right_is_told(tmp_path: Path, name: str, 
     assert open_study(folder).us is not None
 
 
-@pytest.mark.parametrize("name", ["us/sweep.nrrd", "us/left/sweep.mha", "us/sweep.MHA"])
+@pytest.mark.parametrize("name", ["us/sweep.nrrd", "us/left/sweep.mha", "us/left/sweep.MHD"])
 def test_ultrasound_that_is_not_found_is_not_taken_for_none(tmp_path: Path, name: str) -> None:
     folder = study_folder(tmp_path, us=False)
     (folder / name).parent.mkdir(parents=True)
     (folder / "us" / ".DS_Store").touch()
     assert open_study(folder).us is None
     (folder / name).touch()
-    with pytest.raises(InputError, match=rf"us: holds no sweep but {Path(name).name}"):
+    said = rf"us: {Path(name).relative_to('us')} would not be read"
+    with pytest.raises(InputError, match=said):
         open_study(folder)
     (folder / "study.yaml").write_text("us: null\n")
     assert open_study(folder).us is None
+
+
+def test_a_sweep_in_a_folder_of_its_own_beside_others_is_not_passed_over(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "us" / "sweep_002.MHA").touch()
+    assert len(open_study(folder).us.sweeps) == 3
+    (folder / "us" / "notes.txt").touch()
+    assert len(open_study(folder).us.sweeps) == 3
+    (folder / "us" / "left").mkdir()
+    (folder / "us" / "left" / "sweep_003.mha").touch()
+    with pytest.raises(InputError, match=r"left/sweep_003\.mha would not be read"):
+        open_study(folder)
+
+
+def test_files_that_headers_name_are_input_too(tmp_path: Path) -> None:
+    """Or else a change of them would leave products standing that were made of others."""
+    folder = study_folder(tmp_path)
+    ecg, us = folder / "ecg", folder / "us"
+    (ecg / "us.hea").write_text("us/3 2 500 2000\nfirst 1000\n~ 500\nus_second 500\n")
+    (ecg / "first.hea").write_text("first 1 500 1000\nfirst_signal.dat 16 200 16 0 0 0 0 I\n")
+    (ecg / "us_second.hea").write_text("us_second 1 500 500\nlate.dat 16 200 16 0 0 0 0 I\n")
+    for name in ("first_signal.dat", "late.dat"):
+        (ecg / name).touch()
+    (us / "sweep_000.mha").write_text("ObjectType = Image\nElementDataFile = LOCAL\n")
+    (us / "sweep_002.mhd").write_text("ObjectType = Image\nElementDataFile = left.zraw\n")
+    (us / "sweep_003.mhd").write_text("ObjectType = Image\nElementDataFile: part%03d.raw 1 2 1\n")
+    for name in ("left.zraw", "part001.raw", "part002.raw"):
+        (us / name).touch()
+    files = [path.name for path in open_study(folder).input_files()["us"]]
+    of_ecg = {"us.hea", "us.dat", "first.hea", "first_signal.dat", "us_second.hea", "late.dat"}
+    assert of_ecg < set(files)
+    assert {"sweep_002.mhd", "left.zraw", "sweep_003.mhd", "part002.raw"} < set(files)
+    (ecg / "first.hea").unlink()
+    with pytest.raises(InputError, match=r"us\.hea: names first, which is not beside it"):
+        open_study(folder)
+
+
+def test_a_record_may_have_brackets_in_its_name(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    for ending in ("hea", "dat"):
+        (folder / "ecg" / f"us.{ending}").rename(folder / "ecg" / f"us[1].{ending}")
+    (folder / "study.yaml").write_text("ecg: {us: 'ecg/us[1]'}\n")
+    assert {"us[1].hea", "us[1].dat"} < {p.name for p in open_study(folder).input_files()["us"]}
+
+
+def test_folders_behind_links_are_read_and_closed_ones_told(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    elsewhere = tmp_path / "archive"
+    elsewhere.mkdir()
+    (elsewhere / "image").touch()
+    (folder / "cine" / "slice").symlink_to(elsewhere)
+    (elsewhere / "round").symlink_to(folder / "cine")
+    found = open_study(folder).input_files()["cine"]
+    assert folder.resolve() / "cine" / "slice" / "image" in found
+    assert len({path.resolve() for path in found}) == len(found)
+
+    def closed(*_: object, onerror: Callable[[OSError], None], **__: object) -> Iterator[None]:
+        onerror(PermissionError(13, "Permission denied", str(folder / "cine")))
+        yield from ()
+
+    with (
+        mock.patch.object(os, "walk", closed),
+        pytest.raises(InputError, match="cine: cannot be entered"),
+    ):
+        files_below(folder / "cine")
 
 
 @pytest.mark.parametrize("path", [None, "cine", "cine/cine.nii.gz"])

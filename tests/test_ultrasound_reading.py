@@ -71,6 +71,36 @@ def test_frames_times_and_poses_are_read(tmp_path, name, compress):
         np.testing.assert_allclose(sweep.tracker_from_image[k] @ [3, 7, 0, 1], tracker_mm)
 
 
+@pytest.mark.parametrize(
+    ("orientation", "turned"),
+    [
+        *(("MF", PIXELS), ("MFA", PIXELS), ("XX", PIXELS), ("UF", PIXELS[:, :, ::-1])),
+        *(("MN", PIXELS[:, ::-1]), ("una", PIXELS[:, ::-1, ::-1])),
+    ],
+)
+def test_pictures_of_another_orientation_are_turned_as_plus_turns_them(
+    tmp_path, orientation, turned
+):
+    fields = good_fields() | {"UltrasoundImageOrientation": orientation}
+    sweep = read_sweep(write(tmp_path / "s.mha", fields, np.ascontiguousarray(turned)))
+    np.testing.assert_array_equal(sweep.images, PIXELS)
+    np.testing.assert_allclose(sweep.tracker_from_image[1], rigid(1) @ calibration())
+
+
+def test_an_orientation_that_is_none_is_refused(tmp_path):
+    fields = good_fields() | {"UltrasoundImageOrientation": "FM"}
+    with pytest.raises(InputError, match=r"Orientation is FM; it needs MF, UF, MN or UN"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
+def test_compressed_pixels_of_unknown_length_are_refused(tmp_path):
+    """The library would show them black."""
+    path = write(tmp_path / "s.mha", good_fields(), compress=True)
+    path.write_bytes(re.sub(rb"CompressedDataSize = \d+\n", b"", path.read_bytes()))
+    with pytest.raises(InputError, match=r"does not say how long its compressed pixels are"):
+        read_sweep(path)
+
+
 def test_calibration_may_stand_once_for_the_file(tmp_path):
     fields = {k: v for k, v in good_fields().items() if "ImageToProbe" not in k}
     fields["ImageToProbeTransform"] = text(calibration())

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32
 from pipeline.imaging.frames import (
+    LEAST_OF_A_BEAT,
     MIN_PHASES,
     MIN_SLICES,
     NEAREST_SLICES_MM,
@@ -20,14 +21,12 @@ from pipeline.imaging.frames import (
     describe,
     left_out_lines,
     slice_positions,
+    stacks_beside,
 )
 from pipeline.imaging.spacing import fill_gaps, regular_steps
 
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
-
-LEAST_OF_A_BEAT = 0.1
-"""From the first phase to the last; end-diastole and end-systole alone are a quarter apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +102,13 @@ def stack_frames(
         twice, there are fewer than 3 slices or 2 phases, or the timing is not that of one
         heartbeat.
     """
-    chosen, left_out = choose_stack(frames, where)
-    patients = _unlike(chosen, "patient")
+    patients = _unlike(frames, "patient")
     if patients:
         raise InputError(
-            f"{where}: {patients} have different PatientIDs; a stack is of one patient: take the "
+            f"{where}: {patients} have different PatientIDs; a study is of one patient: take the "
             "other's images out"
         )
+    chosen, left_out = choose_stack(frames, where)
     _require_timing(chosen)
     slices, time_name = _in_time(_slices_in_order(chosen), where)
     _require_complete(slices, where)
@@ -126,7 +125,8 @@ def stack_frames(
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
-    return Stack(cine, triggers, rr_ms, source, lines, _doubts_of_place(chosen))
+    doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen)
+    return Stack(cine, triggers, rr_ms, source, lines, doubts)
 
 
 def _unlike(frames: Sequence[Frame], name: str) -> str:
@@ -196,7 +196,8 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
         raise InputError(
             f"{where}: slice {int(away.argmax())} lies {away.max():.3f} of a cycle off the other "
             f"slices' phases, at most half a step ({0.5 / phases.shape[1]:.3f}) can be used; "
-            "all slices need the same phases"
+            "all slices need the same phases; where times after the R peak are the same in all "
+            "slices and RR intervals differ, cine.rr_ms in study.yaml puts all on one"
         )
     return np.asarray(common)
 
@@ -247,7 +248,7 @@ def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[F
         if tie:
             raise InputError(
                 f"{where}: {tie[0].where} and {tie[1].where} show the same slice at the same "
-                f"trigger time {tie[0].times_ms[name]:g} ms; keep one series a slice"
+                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(*tie)}"
             )
     return ordered, name
 
@@ -268,6 +269,15 @@ def _shared_time_names(slices: Sequence[Sequence[Frame]], where: str) -> list[st
                 f"{frame.where} by {', '.join(frame.times_ms)}; export all images in one way"
             )
     return names
+
+
+def _remedy(first: Frame, second: Frame) -> str:
+    if first.series_uid != second.series_uid:
+        return "keep one series a slice"
+    return (
+        "one series gives both, so its trigger times do not tell its phases apart: export them "
+        "with TriggerTime (0018,1060), or give the cine as NIfTI with a timing file"
+    )
 
 
 def _tie(ordered: Sequence[Frame], name: str) -> tuple[Frame, Frame] | None:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
+from pydicom.misc import is_dicom
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame, LeftOut, left_out_lines
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
+from pipeline.study_files import files_below
 
 Groups = Callable[[str], Any]
 """One frame's functional group by name; the whole object for a classic image."""
-
-NOT_IMAGES = {"DICOMDIR"}
-
 
 MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
 MR_CLASSES = {
@@ -28,8 +27,14 @@ MR_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
     "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
 }
+DIRECTORY = "1.2.840.10008.1.3.10"
+"""Media Storage Directory Storage: DICOMDIR, however a system spells its name."""
+
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
+UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
+"""Where Legacy Converted Enhanced objects keep attributes without a functional group."""
+
 PHASE_IMAGES = {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"}
 
 
@@ -61,17 +66,16 @@ def read_dicom_study(
     ``fill`` lets the mean of both neighbours stand in for a slice that is missing.
     Which images are such views, `pipeline.imaging.long_axis_series.long_axis_views` says.
     """
-    paths = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file() and path.name not in NOT_IMAGES and not path.name.startswith(".")
-    )
+    paths = files_below(folder)
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
+    _require_dicom(paths)
     frames: list[Frame] = []
     others: list[LeftOut] = []
     for path in paths:
         dataset = _read(path)
+        if _is_directory(dataset):
+            continue
         other = _other_object(dataset)
         if other:
             uid = str(dataset.get("SeriesInstanceUID", ""))
@@ -86,28 +90,54 @@ def read_dicom_study(
     return stack, long_axis_views(frames, stack.cine)
 
 
+def _require_dicom(paths: Sequence[Path]) -> None:
+    """Refuse files that do not begin as DICOM does, all at once."""
+    others = [path for path in paths if not _begins_as_dicom(path)]
+    if others:
+        more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
+        raise InputError(
+            f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
+            "it out of the folder where it does not belong there"
+        )
+
+
+def _names(paths: Sequence[Path], most: int = 8) -> str:
+    return ", ".join([*(path.name for path in paths[:most]), *(["..."] * (len(paths) > most))])
+
+
+def _begins_as_dicom(path: Path) -> bool:
+    try:
+        return bool(is_dicom(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its rights") from error
+
+
 def _read(path: Path) -> Any:
     try:
         return pydicom.dcmread(path)
-    except (InvalidDicomError, EOFError, ValueError, KeyError) as error:
+    except (InvalidDicomError, OSError, EOFError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: is not DICOM, or damaged; copy it again from the scanner, or take it out of "
             f"the folder where it does not belong there ({str(error).partition('. Use ')[0]})"
         ) from error
 
 
+def _is_directory(dataset: Any) -> bool:
+    return str(dataset.file_meta.get("MediaStorageSOPClassUID", "")) == DIRECTORY
+
+
 def _other_object(dataset: Any) -> str | None:
     """What the object is, when it is known to be something else than an image of a slice."""
     sop_class = str(dataset.get("SOPClassUID", "") or MR_IMAGE)
-    if sop_class in MR_CLASSES:
-        return None
-    name = pydicom.uid.UID(sop_class).name
+    name = MR_CLASSES.get(sop_class) or pydicom.uid.UID(sop_class).name
     if "PixelData" not in dataset:
-        return f"{name}, no image"
+        return None if sop_class in MR_CLASSES else f"{name}, no image"
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"
     placed = "ImagePositionPatient" in dataset or "PerFrameFunctionalGroupsSequence" in dataset
-    return None if placed else f"{name}, without a place in space"
+    # An original MR image without a place may be one of the cine's, spoilt by an export.
+    doubtful = sop_class in MR_CLASSES and _kind(dataset, pydicom.Dataset()) != DERIVED
+    return None if placed or doubtful else f"{name}, without a place in space"
 
 
 def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
@@ -116,8 +146,13 @@ def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
             f"{path}: holds no image (truncated, or not an image object); "
             "copy it again, or take it out of the cine folder"
         )
-    pixels = _pixels(dataset, path)
+    pixels = _upright(_pixels(dataset, path), dataset)
     if "PerFrameFunctionalGroupsSequence" not in dataset:
+        if len(pixels) > 1:
+            raise InputError(
+                f"{path}: has {len(pixels)} frames, and does not say where and when each was taken "
+                "(PerFrameFunctionalGroupsSequence); export it as Enhanced MR, or an image a file"
+            )
         return [_frame(str(path), pixels[0], dataset, lambda _: dataset, rr_ms)]
     own_groups = dataset.PerFrameFunctionalGroupsSequence
     if len(own_groups) != len(pixels):
@@ -138,7 +173,16 @@ def _groups(shared: Any, own: Any) -> Groups:
     def group(name: str) -> Any:
         return (own.get(name) or shared.get(name) or [pydicom.Dataset()])[0]
 
-    return group
+    def with_converted(name: str) -> Any:
+        if name != "CardiacSynchronizationSequence":
+            return group(name)
+        # Converters of classic images leave their times among what has no place of its own.
+        found = pydicom.Dataset()
+        for one in (UNASSIGNED.format("Shared"), UNASSIGNED.format("PerFrame"), name):
+            found.update(group(one))
+        return found
+
+    return with_converted
 
 
 def _pixels(dataset: Any, path: Path) -> Any:
@@ -146,15 +190,51 @@ def _pixels(dataset: Any, path: Path) -> Any:
     try:
         stored = dataset.pixel_array
     except Exception as error:  # pydicom's decoders raise many kinds for damaged pixel data
-        raise InputError(
-            f"{path}: its pixels cannot be read, the file is truncated, damaged or compressed in "
-            f"a way not known here ({error}); copy it again from the scanner, uncompressed"
-        ) from error
+        stored = _read_by_gdcm(dataset, path)
+        if stored is None:
+            raise InputError(
+                f"{path}: its pixels cannot be read, the file is truncated, damaged or compressed "
+                f"in a way not known here ({_syntax(dataset).name}; {error}); copy it again from "
+                "the scanner, uncompressed"
+            ) from error
     if stored.size != max(int(dataset.get("NumberOfFrames", 1) or 1), 1) * dataset.Rows * (
         dataset.Columns
     ):
         raise InputError(f"{path}: is in colour; the cine needs grey images")
     return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
+
+
+def _syntax(dataset: Any) -> Any:
+    return dataset.file_meta.get("TransferSyntaxUID", pydicom.uid.ImplicitVRLittleEndian)
+
+
+def _read_by_gdcm(dataset: Any, path: Path) -> Any:
+    """Stored values of one compressed classic image, by a library that knows more ways, or None.
+
+    That library gives rescaled values: the stored ones are found again from them.
+    """
+    if not _syntax(dataset).is_compressed or "PerFrameFunctionalGroupsSequence" in dataset:
+        return None
+    import SimpleITK as sitk
+
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("GDCMImageIO")
+    reader.SetFileName(str(path))
+    try:
+        values = sitk.GetArrayFromImage(reader.Execute())
+    except RuntimeError:
+        return None
+    slope, intercept = _rescaling(dataset)
+    return np.rint((values - intercept) / slope) if (slope, intercept) != (1, 0) else values
+
+
+def _upright(stored: Any, dataset: Any) -> Any:
+    """Stored values as they grow with brightness."""
+    if dataset.get("PhotometricInterpretation") != "MONOCHROME1":
+        return stored
+    most = 2 ** int(dataset.BitsStored) - 1
+    # Complement of two: the largest is one less than the smallest's magnitude.
+    return (-1 if int(dataset.get("PixelRepresentation", 0)) else most) - stored.astype(np.int64)
 
 
 def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None) -> Frame:
@@ -211,11 +291,16 @@ def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[
 
 def _rescaled(pixels: Any, transformation: Any) -> Any:
     """Stored values times slope plus intercept."""
-    slope = float(transformation.get("RescaleSlope", 1) or 1)
-    intercept = float(transformation.get("RescaleIntercept", 0) or 0)
+    slope, intercept = _rescaling(transformation)
     if (slope, intercept) == (1, 0):
         return pixels
     return pixels.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+
+
+def _rescaling(transformation: Any) -> tuple[float, float]:
+    """Slope, 1 where none or 0 is told, and intercept."""
+    slope = float(transformation.get("RescaleSlope", 1) or 1)
+    return slope, float(transformation.get("RescaleIntercept", 0) or 0)
 
 
 def _times_ms(timing: Any, rr_ms: float | None) -> dict[str, float]:

@@ -18,6 +18,9 @@ from pipeline.geometry import Float
 MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
 """Millivolts in one unit, by its name in lower case."""
 
+MICRO_SIGNS = (b"\xb5", b"\xce\xbc")
+"""In Latin-1 and in UTF-8 (where the first follows another byte), and the Greek letter."""
+
 # Samples a second of an ECG: no two units of time that are a thousandfold apart both fit.
 _RATES_HZ = (100.0, 2000.0)
 # Steps by which times of samples that were taken in order may stray from an even grid.
@@ -93,6 +96,7 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
     """Read a record by its ``.hea`` file."""
     if not header.is_file():
         raise InputError(f"{header}: no such file; a WFDB record needs its .hea and .dat files")
+    _require_plain_units(header)
     try:
         with _quiet_wfdb() as wfdb:
             record = wfdb.rdrecord(str(header.with_suffix("").absolute()), return_res=64)
@@ -103,6 +107,15 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
             "every .dat file it names, of the length it gives; copy the record again"
         ) from error
     return _wfdb_leads(record, header, gaps)
+
+
+def _require_plain_units(header: Path) -> None:
+    """Refuse a micro sign, which the library passes over: microvolts would be read as volts."""
+    lines = header.read_bytes().splitlines()
+    if any(mu in line for line in lines if not line.startswith(b"#") for mu in MICRO_SIGNS):
+        raise InputError(
+            f"{header}: has a unit with a micro sign, which a WFDB header cannot hold; write uV"
+        )
 
 
 def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:

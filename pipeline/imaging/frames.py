@@ -24,8 +24,14 @@ NEAREST_SLICES_MM = 0.5
 """Positions are written with few decimals; slices are never closer than half a millimetre."""
 PARALLEL_COSINE = float(np.cos(np.radians(1)))
 ORIGINAL, DERIVED = "original", "derived"
-Rank = tuple[bool, bool, int, float]
-"""Whether a set is a cine stack, whether original, its number of images, pixels per mm2."""
+LEAST_OF_A_BEAT = 0.1
+"""From the first phase of a cine to the last; end-diastole and end-systole are a quarter apart."""
+USUAL_RR_MS = 900.0
+"""Of a person at rest, where nothing tells."""
+
+Rank = tuple[bool, int, bool, int, float]
+"""Whether a set is a cine stack, the images of the largest one in its direction, whether original,
+its own number of images, pixels per mm2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +102,11 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
     """The frames of the stack, and the others, each with the reason why it is left out.
 
     The stack is the largest set of images alike (parallel, of one matrix, pixel spacing and
-    kind) that is a cine: 3 slices or more, 2 moments or more in a slice. Original images go
-    before derived ones, which stand in for slices of which there are no original ones; of two
-    sets as large the one of smaller pixels is taken. Left out are copies, sets of another
-    direction, and parallel sets that are no cine or show only slices that the stack has.
+    kind) that is a cine: 3 slices or more, 2 moments or more in a slice, a tenth of a beat apart
+    or more. In one direction original images go before derived ones, which stand in for slices of
+    which there are no original ones; of two sets as large the one of smaller pixels is taken. Left
+    out are copies, sets of another direction, and parallel sets that are no cine or show only
+    slices that the stack has.
 
     Raises
     ------
@@ -108,11 +115,11 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
         spacing or pixel direction; or two stacks of different directions are equally large.
     """
     frames, copies = _without_copies(frames)
-    ranked = sorted(((_rank(one), one) for one in _alike(frames)), key=_first, reverse=True)
+    ranked = _ranked(_alike(frames))
     _require_one_largest(ranked, where)
     stack, stills = _without_stills(ranked[0][1])
     slices_mm = slice_positions(stack)
-    left_out = copies + _spared(stills, "one moment of a slice in the stack")
+    left_out = copies + _spared(stills, "one moment of the beat, no cine")
     for _, others in ranked[1:]:
         reason = _why_left_out(stack[0], slices_mm, others)
         if reason:
@@ -203,55 +210,113 @@ def _moments(frames: Sequence[Frame]) -> dict[int, int]:
 
 
 def _is_cine(frames: Sequence[Frame]) -> bool:
-    """Whether most of the slices are seen at two moments or more."""
-    return float(np.median(list(_moments(frames).values()))) >= MIN_PHASES
+    """Whether most of the slices are seen at two moments or more, of different parts of a beat."""
+    many = float(np.median(list(_moments(frames).values()))) >= MIN_PHASES
+    return many and _spans_beat(frames)
 
 
-def _rank(frames: Sequence[Frame]) -> Rank:
-    cine = _is_cine(frames)
-    enough = cine and len(slice_positions(frames)) >= MIN_SLICES
-    per_mm2 = 1 / (frames[0].spacing_mm[0] * frames[0].spacing_mm[1])
-    return enough, frames[0].kind == ORIGINAL, len(frames), per_mm2
+def _spans_beat(frames: Sequence[Frame]) -> bool:
+    """Whether the times tell of a beat rather than of nearly one moment, as those of perfusion and
+    mapping do, which show a slice many times."""
+    first_ms, last_ms = _time_range_ms(frames)
+    beat_ms = next((frame.rr_ms for frame in frames if frame.rr_ms), USUAL_RR_MS)
+    return last_ms - first_ms >= LEAST_OF_A_BEAT * beat_ms
+
+
+def _time_range_ms(frames: Iterable[Frame]) -> tuple[float, float]:
+    times_ms = [next(iter(frame.times_ms.values()), 0.0) for frame in frames]
+    return min(times_ms), max(times_ms)
+
+
+def is_stack(frames: Sequence[Frame]) -> bool:
+    """Whether images alike make up a cine of several slices."""
+    return _is_cine(frames) and len(slice_positions(frames)) >= MIN_SLICES
+
+
+def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame]) -> tuple[str, ...]:
+    """Which other original images would make up a cine stack of another direction, in words."""
+    others = [one for one in _alike(frames) if is_stack(one) and one[0].kind == ORIGINAL]
+    return tuple(
+        f"{one[0].series} ({one[0].where}, ...) is a cine of {len(slice_positions(one))} slices "
+        f"too, in another direction than {stack[0].series}, which was taken for its "
+        f"{len(stack)} images: if that is not the short axis, leave it out of the folder"
+        for one in others
+        if not _parallel(stack[0], one[0])
+    )
+
+
+def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
+    """Sets of images alike, each with its rank, the first one first."""
+    stacks = [one for one in sets if is_stack(one)]
+    ranked = []
+    for one in sets:
+        along = [len(other) for other in stacks if _parallel(one[0], other[0])]
+        per_mm2 = 1 / (one[0].spacing_mm[0] * one[0].spacing_mm[1])
+        enough = any(one is other for other in stacks)
+        original = one[0].kind == ORIGINAL
+        ranked.append(((enough, max(along, default=0), original, len(one), per_mm2), one))
+    return sorted(ranked, key=_first, reverse=True)
 
 
 def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str) -> None:
     rank, (first, *_) = ranked[0]
     for other_rank, (other, *_) in ranked[1:]:
-        if rank[0] and other_rank[:3] == rank[:3] and not _parallel(first, other):
+        if rank[0] and other_rank[:4] == rank[:4] and not _parallel(first, other):
             raise InputError(
-                f"{where}: holds two stacks of {rank[2]} images in different directions, "
+                f"{where}: holds two stacks of {rank[3]} images in different directions, "
                 f"{first.series} ({first.where}) and {other.series} ({other.where}); "
                 "keep the one to be used"
             )
 
 
 def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
-    """Part series that show one moment a slice from cines that show the same slices."""
+    """Part series that are no cine, but of the matrix of cines, from these."""
     by_series: dict[str, list[Frame]] = {}
     for frame in frames:
         by_series.setdefault(frame.series_uid, []).append(frame)
-    moving = [one for one in by_series.values() if max(_moments(one).values()) >= MIN_PHASES]
+    moving = [one for one in by_series.values() if _most_moments(one) > 1 and _spans_beat(one)]
     cine = [frame for one in moving for frame in one]
-    if not cine:
-        return list(frames), []
-    slices_mm = slice_positions(cine)
-    stills = {
-        name
-        for name, one in by_series.items()
-        if max(_moments(one).values()) < MIN_PHASES and _covered(one, cine[0].normal, slices_mm)
-    }
+    stills = {name for name, one in by_series.items() if cine and _is_still(one, cine)}
     return (
         [frame for frame in frames if frame.series_uid not in stills],
         [frame for frame in frames if frame.series_uid in stills],
     )
 
 
+def _is_still(series: Sequence[Frame], cine: Sequence[Frame]) -> bool:
+    """Whether a series shows one moment, of several slices or of slices that cines show, or many
+    within a small part of the beat that cines show of these slices."""
+    slices_mm, normal = slice_positions(cine), cine[0].normal
+    covered = _covered(series, normal, slices_mm)
+    if _most_moments(series) < MIN_PHASES:
+        return covered or len(slice_positions(series)) > 1
+    if _spans_beat(series) or not covered:
+        return False
+    # A slice that is stored in pieces has the rest of its times elsewhere.
+    along_mm = np.array([float(frame.middle_mm @ normal) for frame in series])
+    beside = [
+        frame
+        for frame in cine
+        if np.abs(along_mm - float(frame.middle_mm @ normal)).min() < _half_step_mm(slices_mm)
+    ]
+    (first_ms, last_ms), (start_ms, end_ms) = _time_range_ms(series), _time_range_ms(beside)
+    return start_ms <= first_ms and last_ms <= end_ms
+
+
+def _most_moments(frames: Sequence[Frame]) -> int:
+    return max(_moments(frames).values())
+
+
+def _half_step_mm(slices_mm: Float) -> float:
+    step_mm = float(np.diff(slices_mm).min()) if len(slices_mm) > 1 else 2 * NEAREST_SLICES_MM
+    return 0.5 * step_mm
+
+
 def _covered(frames: Iterable[Frame], normal: Float, slices_mm: Float) -> bool:
     """Whether the frames show only slices that are there: nearer than half a step to one."""
-    step_mm = float(np.diff(slices_mm).min()) if len(slices_mm) > 1 else 2 * NEAREST_SLICES_MM
     along_mm = np.array([float(frame.middle_mm @ normal) for frame in frames])
     away_mm = np.abs(along_mm[:, None] - slices_mm).min(axis=1)
-    return bool(away_mm.max() < 0.5 * step_mm)
+    return bool(away_mm.max() < _half_step_mm(slices_mm))
 
 
 def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> str | None:
@@ -259,8 +324,10 @@ def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> st
     if not _parallel(first, other):
         angle = np.degrees(np.arccos(min(abs(float(first.normal @ other.normal)), 1.0)))
         return f"not parallel to the stack, turned by {angle:.0f} degrees"
-    if max(_moments(others).values()) < MIN_PHASES:
+    if _most_moments(others) < MIN_PHASES:
         return "one moment a slice, no cine"
+    if not _spans_beat(others):
+        return "all at nearly one moment of the beat, no cine"
     if not _covered(others, first.normal, slices_mm):
         return None
     rows, columns = other.pixels.shape

@@ -12,6 +12,7 @@ import nibabel
 import numpy as np
 import numpy.typing as npt
 from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
@@ -179,8 +180,14 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
 def _load(path: Path) -> Any:
     try:
         image: Any = nibabel.load(path)
-    except (ImageFileError, OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: cannot be read as NIfTI ({error})") from error
+        # A damaged placement shows when it is asked for.
+        image.get_qform(coded=True)
+    except (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, zlib.error) as error:
+        raise InputError(
+            f"{path}: cannot be read as NIfTI ({error}); copy or convert it again"
+        ) from error
+    if image.get_data_dtype().kind == "V":
+        raise InputError(f"{path}: its voxels are colours; store one grey value a voxel")
     if image.get_data_dtype().kind == "c":
         raise InputError(f"{path}: its voxels are complex numbers; store their magnitude")
     return image

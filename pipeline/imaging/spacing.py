@@ -10,6 +10,9 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.frames import Frame
 
+NEARLY_ONE = 0.4
+"""A step of less than this share of the usual one: with single slices missing it is half of it."""
+
 WIDEST_GAP_MM = 25.0
 """Across a wider gap nothing is interpolated: an apex or a valve plane would fit in it."""
 
@@ -41,6 +44,7 @@ def regular_steps(
     """
     positions_mm = np.array([one[0].position_mm for one in slices])
     lengths_mm = np.diff(positions_mm, axis=0) @ slices[0][0].normal
+    _require_no_second(slices, lengths_mm, where)
     usual_mm = float(lengths_mm.min())
     counts = np.maximum(np.rint(lengths_mm / usual_mm), 1).astype(int)
     numbers = np.concatenate([[0], np.cumsum(counts)])
@@ -70,6 +74,19 @@ def regular_steps(
             f"{usual_mm:.2f} mm apart{remedy}"
         )
     return np.asarray(step_mm), np.asarray(numbers, np.int64)
+
+
+def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, where: str) -> None:
+    """Refuse a slice that was taken again beside its first place."""
+    short = np.flatnonzero(lengths_mm < NEARLY_ONE * np.median(lengths_mm))
+    if len(short):
+        first, second = (slices[short[0] + k][0] for k in (0, 1))
+        raise InputError(
+            f"{where}: slices {short[0]} and {short[0] + 1} lie {lengths_mm[short[0]]:.2f} mm "
+            f"apart, most others {np.median(lengths_mm):.2f} mm: nearly the same slice is given "
+            f"twice, by {first.series} ({first.where}) and by {second.series} ({second.where}); "
+            "keep one"
+        )
 
 
 def fill_gaps(intensity: Float32, numbers: Integer) -> tuple[Float32, tuple[int, ...]]:

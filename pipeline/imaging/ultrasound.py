@@ -77,6 +77,7 @@ def read_sweep(path: Path) -> Sweep:
     """
     path = Path(path)
     images, header = _read_image(path)
+    images = _as_scanned(path, images, header)
     frames = _frame_fields(path, header, len(images))
     valid = [k for k, fields in enumerate(frames) if _is_valid(fields)]
     if not valid:
@@ -157,6 +158,11 @@ def _require_all_bytes(path: Path) -> None:
     if not pixels.is_file():
         raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
     packed = header.get("CompressedData", "False").upper() == "TRUE"
+    if packed and _number(header.get("CompressedDataSize")) is None:
+        raise InputError(
+            f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
+            "it again, or uncompressed"
+        )
     needed = _number(header.get("CompressedDataSize")) if packed else _pixel_bytes(header)
     found = pixels.stat().st_size - (start if pixels == path else 0)
     if needed is not None and found < needed:
@@ -240,6 +246,22 @@ def _require_grey_frames(path: Path, image: Any) -> None:
         raise InputError(
             f"{path}: has {components} values a pixel; export grey values, one a pixel"
         )
+
+
+def _as_scanned(path: Path, images: Any, header: Fields) -> Any:
+    """Pixels whose columns count up to the transducer's marked side, and rows away from it: MF.
+
+    ImageToProbe belongs to pictures in this order, to which PLUS turns others when it reads them.
+    """
+    orientation = header.get("UltrasoundImageOrientation", "MF").upper()
+    if not re.fullmatch("[MU][FN][AD]?|XX", orientation):
+        raise InputError(
+            f"{path}: UltrasoundImageOrientation is {orientation}; it needs MF, UF, MN or UN "
+            "(columns count up to the marked or unmarked side, rows to the far or near end)"
+        )
+    if orientation[0] == "U":
+        images = images[:, :, ::-1]
+    return images[:, ::-1] if orientation[1] == "N" else images
 
 
 def _frame_fields(path: Path, header: Fields, slices: int) -> list[Fields]:

@@ -1,0 +1,336 @@
+"""What scanners and archives put beside a cine, or write otherwise than is usual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from cine_files import (
+    NORMAL,
+    ORIGIN_MM,
+    PHASES,
+    RR_MS,
+    SLICES,
+    STEP_MM,
+    assert_is_the_stack,
+    dicom_frame,
+    enhanced_object,
+    in_series,
+    item,
+    pixel_value,
+    write_dicom,
+)
+from pydicom import dcmread
+from pydicom.dataset import Dataset, FileDataset
+from pydicom.uid import MediaStorageDirectoryStorage
+
+from pipeline.errors import InputError
+from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.imaging.nifti import read_nifti_cine
+
+ALL_FRAMES = [(number, phase) for number in range(SLICES) for phase in range(PHASES)]
+
+
+def beside_the_stack(folder: Path, others: list[FileDataset]) -> Path:
+    """The good stack as series 1, and other images as series 9."""
+    write_dicom(folder, lambda data, number, phase: bool(in_series(data, 1, "short axis")))
+    for k, data in enumerate(others):
+        in_series(data, 9, "other").save_as(folder / f"other_{k:03d}.dcm")
+    return folder
+
+
+def series(slices: list[int], times_ms: list[float]) -> list[FileDataset]:
+    """Images of some slices at some moments that none of the stack's equals."""
+    found = []
+    for number in slices:
+        for k, time_ms in enumerate(times_ms):
+            data = dicom_frame(number, 0)
+            data.TriggerTime = time_ms
+            data.PixelData = (3 * pixel_value(k, number)).tobytes()
+            found.append(data)
+    return found
+
+
+def coarser(found: list[FileDataset]) -> list[FileDataset]:
+    for data in found:
+        data.PixelSpacing = [2 * value for value in data.PixelSpacing]
+    return found
+
+
+AT_ONE_MOMENT = [400.0 + 0.5 * k for k in range(40)]
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        series([0, 1, 2], AT_ONE_MOMENT),
+        coarser(series([0, 1, 2], AT_ONE_MOMENT)),
+        series([2], AT_ONE_MOMENT),
+        series([SLICES, SLICES + 1], [500.0]),
+    ],
+    ids=["perfusion", "perfusion, other pixels", "mapping", "late enhancement beyond the stack"],
+)
+def test_what_shows_one_moment_of_the_beat_is_no_cine_however_many_images_it_has(
+    tmp_path: Path, others: list[FileDataset]
+) -> None:
+    stack = read_dicom_cine(beside_the_stack(tmp_path, others))
+    assert_is_the_stack(stack)
+    assert len(stack.left_out) == 1
+    assert f'series 9 "other": {len(others)} images' in stack.left_out[0]
+    assert "no cine" in stack.left_out[0]
+    assert stack.remarks == ()
+
+
+def test_a_slice_stored_in_two_series_of_which_one_is_short_stays_whole(tmp_path: Path) -> None:
+    def parted(data: FileDataset, number: int, phase: int) -> bool:
+        data.TriggerTime = 20.0 * phase + 600.0 * (phase > 1)
+        in_series(data, 2 if (number, phase > 2) == (1, True) else 1, "part")
+        return True
+
+    write_dicom(tmp_path, parted)
+    assert read_dicom_cine(tmp_path).cine.intensity.shape[:2] == (PHASES, SLICES)
+
+
+def across(slices: int, kind: str) -> list[FileDataset]:
+    """A cine stack in another direction."""
+    found = series(list(range(slices)), [RR_MS * k / PHASES for k in range(PHASES)])
+    for data in found:
+        number = round(float((np.array(data.ImagePositionPatient) - ORIGIN_MM) @ NORMAL) / STEP_MM)
+        data.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+        data.ImagePositionPatient = [0, 0, number * STEP_MM]
+        data.ImageType = [kind, "PRIMARY", "M"]
+    return found
+
+
+def test_a_stack_of_another_direction_is_told_whichever_is_larger(tmp_path: Path) -> None:
+    stack = read_dicom_cine(beside_the_stack(tmp_path / "less", across(3, "ORIGINAL")))
+    assert_is_the_stack(stack)
+    assert 'series 9 "other" (' in stack.remarks[0]
+    assert "cine of 3 slices too" in stack.remarks[0]
+    stack = read_dicom_cine(beside_the_stack(tmp_path / "more", across(SLICES + 1, "ORIGINAL")))
+    assert stack.cine.intensity.shape[1] == SLICES + 1
+    assert 'series 1 "short axis" (' in stack.remarks[0]
+
+
+def test_a_few_original_slices_do_not_go_before_a_derived_stack_across(tmp_path: Path) -> None:
+    def derived(data: FileDataset, number: int, phase: int) -> bool:
+        data.ImageType = ["DERIVED", "PRIMARY", "DIS2D"]
+        return bool(in_series(data, 1, "short axis"))
+
+    write_dicom(tmp_path, derived)
+    for k, data in enumerate(across(3, "ORIGINAL")):
+        in_series(data, 9, "two chambers").save_as(tmp_path / f"other_{k:03d}.dcm")
+    stack = read_dicom_cine(tmp_path)
+    assert_is_the_stack(stack)
+    assert "two chambers" in stack.remarks[0]
+
+
+@pytest.mark.parametrize("slices", [3, SLICES + 1])
+def test_images_of_another_patient_are_refused_even_where_they_would_be_left_out(
+    tmp_path: Path, slices: int
+) -> None:
+    others = across(slices, "ORIGINAL")
+    for data in others:
+        data.PatientID = "somebody else"
+    beside_the_stack(tmp_path, others)
+    for path in tmp_path.glob("0*.dcm"):
+        data = dcmread(path)
+        data.PatientID = "somebody"
+        data.save_as(path)
+    with pytest.raises(InputError, match="different PatientIDs; a study is of one patient"):
+        read_dicom_cine(tmp_path)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_images_that_are_stored_white_for_black_are_turned(tmp_path: Path, signed: bool) -> None:
+    def turned(data: FileDataset, number: int, phase: int) -> bool:
+        data.PhotometricInterpretation = "MONOCHROME1"
+        data.BitsStored, data.PixelRepresentation = 12, int(signed)
+        # PS3.3 C.7.6.3.1.2: the least sample value is shown white.
+        stored = (-1 if signed else 4095) - pixel_value(phase, number).astype(np.int16)
+        data.PixelData = stored.tobytes()
+        return True
+
+    write_dicom(tmp_path, turned)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+def test_lossless_jpeg_is_read_exactly_with_its_rescaling(tmp_path: Path) -> None:
+    def packed(data: FileDataset, number: int, phase: int) -> bool:
+        writer = sitk.ImageFileWriter()
+        writer.SetImageIO("GDCMImageIO")
+        writer.SetFileName(str(tmp_path / "packed.dcm"))
+        writer.UseCompressionOn()
+        writer.SetCompressor("JPEG")
+        writer.Execute(sitk.GetImageFromArray(2 * data.pixel_array[None] + 6))
+        other = dcmread(tmp_path / "packed.dcm")
+        (tmp_path / "packed.dcm").unlink()
+        data.file_meta.TransferSyntaxUID = other.file_meta.TransferSyntaxUID
+        assert data.file_meta.TransferSyntaxUID == "1.2.840.10008.1.2.4.70"
+        data["PixelData"] = other["PixelData"]
+        for name in ("BitsStored", "HighBit", "BitsAllocated", "PixelRepresentation"):
+            setattr(data, name, getattr(other, name))
+        data.RescaleSlope, data.RescaleIntercept = "0.5", "-3"
+        return True
+
+    write_dicom(tmp_path / "cine", packed)
+    assert_is_the_stack(read_dicom_cine(tmp_path / "cine"))
+    path = next((tmp_path / "cine").glob("*.dcm"))
+    data = dcmread(path)
+    data.PixelData = data.PixelData[:30]
+    data["PixelData"].is_undefined_length = True
+    data.save_as(path)
+    with pytest.raises(InputError, match=r"pixels cannot be read.*JPEG Lossless"):
+        read_dicom_cine(tmp_path / "cine")
+
+
+def in_colour() -> FileDataset:
+    data = dicom_frame(0, 0)
+    data.SamplesPerPixel, data.PhotometricInterpretation = 3, "RGB"
+    data.PlanarConfiguration, data.BitsAllocated, data.BitsStored, data.HighBit = 0, 8, 8, 7
+    data.PixelData = bytes(3 * data.Rows * data.Columns)
+    return data
+
+
+def without_place() -> FileDataset:
+    data = dicom_frame(0, 0)
+    data.ImageType = ["DERIVED", "SECONDARY", "OTHER"]
+    del data.ImagePositionPatient, data.ImageOrientationPatient
+    return data
+
+
+@pytest.mark.parametrize(
+    ("other", "words"), [(in_colour, "in colour"), (without_place, "without a place in space")]
+)
+def test_maps_and_graphs_that_are_mr_objects_are_left_out(
+    tmp_path: Path, other: Callable[[], FileDataset], words: str
+) -> None:
+    stack = read_dicom_cine(beside_the_stack(tmp_path, [other()]))
+    assert_is_the_stack(stack)
+    assert f"MR Image Storage, {words}" in stack.left_out[0]
+
+
+def test_an_original_image_without_a_place_is_refused(tmp_path: Path) -> None:
+    data = without_place()
+    data.ImageType = ["ORIGINAL", "PRIMARY", "M"]
+    with pytest.raises(InputError, match="has no ImagePositionPatient"):
+        read_dicom_cine(beside_the_stack(tmp_path, [data]))
+
+
+def test_several_frames_that_do_not_say_where_they_lie_are_refused(tmp_path: Path) -> None:
+    data = dicom_frame(0, 0)
+    data.NumberOfFrames = 3
+    data.PixelData = 3 * data.PixelData
+    with pytest.raises(InputError, match="has 3 frames, and does not say where and when"):
+        read_dicom_cine(beside_the_stack(tmp_path, [data]))
+
+
+def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
+    tmp_path: Path,
+) -> None:
+    beside_the_stack(tmp_path, [])
+    directory = dicom_frame(0, 0)
+    directory.file_meta.MediaStorageSOPClassUID = MediaStorageDirectoryStorage
+    directory.save_as(tmp_path / "dicomdir")
+    for name in ("Thumbs.db", ".DS_Store", "desktop.ini"):
+        (tmp_path / name).write_bytes(b"left")
+    stack = read_dicom_cine(tmp_path)
+    assert_is_the_stack(stack)
+    assert stack.left_out == ()
+    for name in ("readme.txt", "viewer.exe", "EMPTY"):
+        (tmp_path / name).write_bytes(b"x" * (name != "EMPTY"))
+    with pytest.raises(InputError, match=r"EMPTY and 2 more \(readme.txt, viewer.exe\): is not"):
+        read_dicom_cine(tmp_path)
+
+
+def test_times_that_a_converter_left_among_the_unassigned_are_read(tmp_path: Path) -> None:
+    data = enhanced_object(ALL_FRAMES)
+    data.SOPClassUID = "1.2.840.10008.5.1.4.1.1.4.4"
+    shared: Dataset = data.SharedFunctionalGroupsSequence[0]
+    shared.UnassignedSharedConvertedAttributesSequence = item(NominalInterval=int(RR_MS))
+    for own, (_, phase) in zip(data.PerFrameFunctionalGroupsSequence, ALL_FRAMES, strict=True):
+        del own.CardiacSynchronizationSequence
+        time_ms = phase * RR_MS / PHASES
+        own.UnassignedPerFrameConvertedAttributesSequence = item(TriggerTime=time_ms)
+    data.save_as(tmp_path / "converted.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+def again_beside_its_place(data: FileDataset, number: int, phase: int) -> bool:
+    data.ImagePositionPatient = (
+        ORIGIN_MM + (number - 0.9 * (number == 3)) * STEP_MM * NORMAL
+    ).tolist()
+    return True
+
+
+def without_times(data: FileDataset, number: int, phase: int) -> bool:
+    data.TriggerTime = 0
+    return True
+
+
+def prospective(data: FileDataset, number: int, phase: int) -> bool:
+    data.TriggerTime, data.NominalInterval = 150.0 * phase, 700 + 150 * number
+    return True
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (again_beside_its_place, "slices 2 and 3 lie 1.00 mm apart.*given twice, by images of"),
+        (without_times, "do not tell its phases apart"),
+        (prospective, "same in all slices and RR intervals differ, cine.rr_ms"),
+    ],
+)
+def test_messages_name_what_is_at_fault(tmp_path: Path, change: Any, words: str) -> None:
+    write_dicom(tmp_path, change)
+    with pytest.raises(InputError, match=words):
+        read_dicom_cine(tmp_path)
+
+
+def test_one_rr_interval_for_all_serves_prospective_triggering(tmp_path: Path) -> None:
+    write_dicom(tmp_path, prospective)
+    cine = read_dicom_cine(tmp_path, rr_ms=900.0).cine
+    np.testing.assert_allclose(cine.phases, 150 * np.arange(PHASES) / 900)
+
+
+def nifti_bytes() -> bytearray:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4, 5), np.int16), np.diag([1, 1, 8, 1.0]))
+    image.set_qform(image.affine, 1)
+    image.set_sform(None, 0)
+    return bytearray(image.to_bytes())
+
+
+def with_numbers(offset: int, values: list[float]) -> bytearray:
+    """The header's numbers from ``offset`` on (nifti1.h) in single precision."""
+    content = nifti_bytes()
+    content[offset : offset + 4 * len(values)] = np.array(values, "<f4").tobytes()
+    return content
+
+
+def of_datatype(code: int, bits: int) -> bytearray:
+    content = nifti_bytes()
+    content[70:74] = np.array([code, bits], "<i2").tobytes()
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (with_numbers(112, [0.5, np.nan]), "cannot be read as NIfTI"),
+        (with_numbers(256, [0.9, 0.9, 0.9]), "cannot be read as NIfTI"),
+        (of_datatype(9999, 16), "cannot be read as NIfTI"),
+        (of_datatype(128, 24), "voxels are colours"),
+    ],
+    ids=["intercept", "quaternion", "datatype", "RGB"],
+)
+def test_a_nifti_header_without_sense_is_refused(
+    tmp_path: Path, content: bytearray, words: str
+) -> None:
+    (tmp_path / "cine.nii").write_bytes(content)
+    with pytest.raises(InputError, match=rf"cine\.nii: .*{words}"):
+        read_nifti_cine(tmp_path / "cine.nii", None, 900.0)
