@@ -37,6 +37,14 @@ NOTCHED: Waves = (
 NORMAL: Waves = (*P, *QRS, *T)
 TALL_T: Waves = (*P, *QRS, (0.27, 0.042, 1.20, 0.70))
 TALL_P: Waves = ((-0.16, 0.022, 0.35, 0.20), *QRS, *T)
+# QRS complexes as small as a lead along the heart's plane of turning shows them, T all but flat.
+WEAK: Waves = (
+    (-0.19, 0.017, 0.16, 0.14),
+    *((at, 1.3 * width, 0.3 * one, 0.3 * two) for at, width, one, two in QRS),
+    (0.28, 0.050, 0.05, 0.03),
+)
+# T waves of wide beats are large and, in a slow heart, late.
+SLOW_WIDE: Waves = (*WIDE[:2], (0.41, 0.055, 0.90, -0.80))
 LONE_P: Waves = ((-0.16, 0.022, 0.35, 0.20),)
 
 
@@ -215,6 +223,10 @@ CASES = {
     "second lead bad": partial(_one_bad, lead=1),
     "bursts": _bursts,
     "waxing": _waxing,
+    "weak beats, tall P": partial(_plain, waves=WEAK, rr_s=0.95, scatter=0.08, noise_mv=0.02),
+    "wide beats in a slow heart": partial(
+        _alternating, one=scaled(NORMAL, 0.6), other=SLOW_WIDE, early_share=0.3
+    ),
 }
 
 

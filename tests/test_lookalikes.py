@@ -1,10 +1,17 @@
-"""Outflows and atria taken for a second aorta, and stomachs for an atrium."""
+"""Outflows and atria taken for a second aorta, stomachs for an atrium, and ventricles for one."""
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.imaging.lookalikes import clear_apex, part_from_right_heart
+from pipeline.imaging.lookalikes import (
+    ATRIUM_TOO_OFTEN,
+    clear_apex,
+    favour_right_ventricle,
+    part_from_right_heart,
+)
 
 SIDE, PIXEL_MM = 64, 1.5
 CAVITY, MUSCLE, RV, LA, RA, AORTA = 1, 2, 3, 4, 5, 6
@@ -115,3 +122,22 @@ def test_where_no_ventricle_is_nothing_is_cleared():
     value = one_hot(labels)
     clear_apex(value)
     np.testing.assert_array_equal(value.argmax(axis=2), labels)
+
+
+@given(
+    rv=st.floats(0, 1, width=32),
+    ra=st.floats(0, 1, width=32),
+    rest=st.floats(0.125, 1, width=32),
+)
+def test_odds_of_right_ventricle_and_atrium_change_by_the_factor_and_nothing_else(rv, ra, rest):
+    value = np.zeros((1, 1, 7, 1, 1), np.float32)
+    value[0, 0, [RV, RA, 0], 0, 0] = np.array([rv, ra, rest]) / (rv + ra + rest)
+    before = value[0, 0, :, 0, 0].copy()
+    favour_right_ventricle(value)
+    after = value[0, 0, :, 0, 0]
+    np.testing.assert_array_equal(np.delete(after, [RV, RA]), np.delete(before, [RV, RA]))
+    assert after.min() >= 0
+    assert after[RV] + after[RA] == pytest.approx(before[RV] + before[RA], abs=1e-6)
+    # Bayes' rule: odds after = odds before times the ratio of the priors.
+    ours, theirs = after[RV] * before[RA], ATRIUM_TOO_OFTEN * before[RV] * after[RA]
+    assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)

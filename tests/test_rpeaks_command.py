@@ -64,7 +64,9 @@ def test_a_disk_that_takes_no_files_is_told(ecg, tmp_path, capsys, monkeypatch):
 
     opened = Path.open
     monkeypatch.setattr(
-        Path, "open", lambda p, m="r", *a, **k: refused(p) if "w" in m else opened(p, m, *a, **k)
+        Path,
+        "open",
+        lambda p, mode="r", *a, **k: refused(p) if "w" in mode else opened(p, mode, *a, **k),
     )
     monkeypatch.setattr(Path, "unlink", refused)
     assert main(["rpeaks", str(tmp_path / "rec"), "--out", str(tmp_path / "p.csv")]) == 2

@@ -1,4 +1,4 @@
-"""What looks like the aorta or the left atrium and is not."""
+"""What looks like the aorta or an atrium and is not."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ LEAST_DISC_MM2, LEAST_ROOT = 100.0, 0.25
 """The root must be this large beside the other disc, and this share of all that is taken: else it
 is the root itself that stands on wrong labels, with a stray spot beside it."""
 
+ATRIUM_TOO_OFTEN = 2.5
+"""How much more often training shows right atrium than right ventricle where the two meet. Chosen
+by Dice on ten people of the second renderer and four phantoms; 6.7 does as well."""
+
 LEAST_CUT = 0.1
 """A smaller share of the ventricle's widest cut does not make a plane its tip."""
 
@@ -47,6 +51,28 @@ def clear_apex(value: Float32) -> None:
     for name in OPENINGS:
         low[:, :, 0] += low[:, :, LABELS[name]]
         low[:, :, LABELS[name]] = 0
+
+
+def favour_right_ventricle(value: Float32) -> None:
+    """Give back to the right ventricle what is right atrium because training showed that too often.
+
+    For tricuspid planes that come down in systole many training images have the atrium beside the
+    ventricle's last rings. A network's odds hold how often it was shown either: they are divided by
+    how much too often that was (Saerens, Latinne and Decaestecker, Neural Comput 14:21-41, 2002).
+    What a pixel is likely to be of the two together, and all else, stays. Changes ``value`` in
+    place.
+
+    Parameters
+    ----------
+    value
+        ``(phase, plane, class, row, column)`` probabilities.
+    """
+    for part in value:
+        ventricle, atrium = (part[:, LABELS[name]] for name in ("rv_cavity", "right_atrium"))
+        either = ventricle + atrium
+        odds = np.maximum(ventricle + atrium / ATRIUM_TOO_OFTEN, np.finfo(np.float32).tiny)
+        ventricle[:] = np.minimum(either * (ventricle / odds), either)
+        atrium[:] = either - ventricle
 
 
 def ventricle_cuts(value: Float32) -> Float:

@@ -24,7 +24,7 @@ from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
-from pipeline.imaging.lookalikes import clear_apex
+from pipeline.imaging.lookalikes import clear_apex, favour_right_ventricle
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import Orientation, View
 
@@ -112,6 +112,7 @@ def segment_cine(
     place = locate_heart(cine)
     found = label_probability(cine, place.view, settings.most_views, progress)
     clear_apex(found.value)
+    favour_right_ventricle(found.value)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
     seen = _drawn(found)
     _require_ring(seen, found.view)

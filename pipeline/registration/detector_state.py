@@ -7,13 +7,14 @@ from typing import NamedTuple
 from pipeline.geometry import Float, Integer
 
 # Rows of found beats.
-TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, FIELDS = range(7)
+TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, INSTEAD, FIELDS = range(8)
 # Columns of the state of a lead.
 (
     LEVEL, NOISE, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
     SIGN, SCATTER, LEAN, LEAN_NOW, PEAK, FINER, HEIGHT_MV,
-    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END, LEAD_FIELDS,
-) = range(26)  # fmt: skip
+    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END,
+    LEVEL_BEFORE, LEAD_FIELDS,
+) = range(27)  # fmt: skip
 # Counters.
 (
     SEEN,
@@ -27,10 +28,12 @@ TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, FIELDS = range(7)
     LEARN_AT,
     USABLE,
     BEATS,
+    BEFORE_LAST,
+    INTERVALS_BEFORE,
     COUNTERS,
-) = range(12)
+) = range(14)
 # Numbers.
-BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, NUMBERS = range(5)
+BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, LAST_LIKENESS, NUMBERS = range(6)
 KEPT_INTERVALS, KEPT_WAVES = 8, 64
 SHAPE_POINTS = 21
 """Places about R at which shapes are compared."""

@@ -15,29 +15,32 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
 from pipeline.registration.detector_state import (
     BAD_UNTIL,
     BEATS,
+    BEFORE_LAST,
     BEST,
     BEST_AT,
     BETWEEN,
     FOUND,
     HEIGHT,
+    INSTEAD,
     INTERVALS,
+    INTERVALS_BEFORE,
     KEPT_INTERVALS,
     KEPT_WAVES,
     KNOWN,
     LAST,
     LAST_BEAT,
     LAST_HEIGHT,
+    LAST_LIKENESS,
     LATE,
     LEARN_AT,
     LEARNT,
     LEVEL,
+    LEVEL_BEFORE,
     LIKENESS,
     NOISE,
     RUN,
@@ -49,19 +52,21 @@ from pipeline.registration.detector_state import (
     Plan,
     State,
 )
-from pipeline.registration.quality import (
-    RUN_S,
-    SETTLE_S,
-    shows_nothing,
-    watch,
-)
-from pipeline.registration.waves import learn_beat, measure_beat
+from pipeline.registration.levels import REFRACTORY_S, follow_noise, learn_level, wave_levels
+from pipeline.registration.quality import RUN_S, SETTLE_S, shows_nothing, watch
+from pipeline.registration.waves import ALIKE, learn_beat, measure_beat
 
-REFRACTORY_S = 0.20
-T_WAVE_S = 0.36
-"""Until so long after a beat a wave of less than half its energy is that beat's T wave."""
+AHEAD_S, AHEAD, LOW = 0.25, 2.0, 0.7
+"""A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
+ventricle beats twice in that time."""
+T_WAVE_S, USUAL_S = 0.36, 0.8
+"""Until so long after a beat a wave of less than half its energy is that beat's T wave; where the
+usual RR interval is longer than so, later by its root (Bazett, Heart 7:353-370, 1920)."""
 LATE_T_WAVE_S = 0.45
-"""The same when a beat is overdue, for then the heart is slow and its T waves are late."""
+"""The same at most, and when a beat is overdue, for then the heart is slow."""
+FADE_S, LARGE = 0.15, 1.6
+"""Beats of another shape, or so large, are wide or have large T waves: after them what a wave needs
+falls to nothing in so long, not at once."""
 THRESHOLD = 0.3
 """Place of the threshold between the levels of noise (0) and of beats (1)."""
 STRANGE_THRESHOLD, STRANGE_LATE = 0.36, 0.20
@@ -150,7 +155,7 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
     first = max(0, middle - plan.length + 4 * plan.half)
     clear = False
     for k in range(len(s.leads)):
-        level, noise = _levels(k, first, middle, plan, s)
+        level, noise = wave_levels(k, first, middle, plan, s)
         s.leads[k, LEVEL] = level
         s.leads[k, NOISE] = max(noise, 0.02 * level)
         clear = clear or level > CLEAR * noise
@@ -166,35 +171,10 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
 
 
 @compiled
-def _levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float]:
-    """Energy of a lead's beats and of what lies between them, from a stretch of samples.
-
-    Beats are the highest waves; the one highest of all may be a tug at the electrode.
-    """
-    seen, waves = np.empty(last - first + 1), np.empty(KEPT_WAVES)
-    count, best, best_at = 0, 0.0, first
-    for i in range(first, last + 1):
-        seen[i - first] = s.energy[k, i % plan.length]
-        if seen[i - first] > best:
-            best, best_at = seen[i - first], i
-        elif i - best_at > REFRACTORY_S * plan.rate_hz:
-            if count < KEPT_WAVES:
-                waves[count] = best
-                count += 1
-            best, best_at = 0.0, i
-    seen.sort()
-    if count == 0:
-        return 0.8 * seen[-1], seen[int(0.7 * len(seen))]
-    found = np.sort(waves[:count])
-    high = found[found > 0.4 * found[max(0, count - 2)]]
-    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))]
-
-
-@compiled
 def _decide(i: int, plan: Plan, s: State) -> None:
     """Look at the energy at sample ``i``: has a wave passed, is a beat overdue?"""
     for k in range(len(s.leads)):
-        _follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
+        follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
     height = _height(i, plan, s)
     s.fused[i % plan.length] = height
     if height > s.numbers[BEST]:
@@ -208,14 +188,6 @@ def _decide(i: int, plan: Plan, s: State) -> None:
             _judge(at, plan, s)
     if i - s.counters[LAST_BEAT] > OVERDUE * s.numbers[USUAL_RR]:
         _look_back(i, plan, s)
-
-
-@compiled
-def _follow_noise(lead: Float, energy: float, rate_hz: float) -> None:
-    """Track the energy that 7 samples in 10 stay under: QRS complexes take less than 3."""
-    step = 4.0 / rate_hz
-    lead[NOISE] *= 1.0 + 0.7 * step if energy > lead[NOISE] else 1.0 - 0.3 * step
-    lead[NOISE] = max(lead[NOISE], 0.02 * lead[LEVEL])
 
 
 @compiled
@@ -243,18 +215,39 @@ def _height(i: int, plan: Plan, s: State) -> float:
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
     since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
-    if since_s < REFRACTORY_S:
+    ahead = since_s < AHEAD_S and s.counters[BEATS] > 1 and s.numbers[LAST_HEIGHT] < LOW
+    if since_s < REFRACTORY_S and not ahead:
         return
     # Leads that turned out to be lost since then no longer count.
     _refuse_knocks(at, plan, s)
     height = _height(at, plan, s)
-    if _is_beat(since_s, height, 1.0, s) and _resembles(at, height, 1.0, plan, s):
+    instead = ahead and height > AHEAD * s.numbers[LAST_HEIGHT]
+    if instead:
+        since_s = (at - s.counters[BEFORE_LAST]) / plan.rate_hz
+    if since_s < REFRACTORY_S:
+        return
+    if _is_beat(since_s, height, 1.0, plan, s) and _resembles(at, height, 1.0, plan, s):
+        if instead:
+            _take_back(s)
+        s.found[s.counters[FOUND], INSTEAD] = 1.0 if instead else 0.0
         _accept(at, height, 0.0, plan, s)
         return
     s.numbers[BETWEEN] += 0.125 * (min(height, 0.6) - s.numbers[BETWEEN])
     kept = s.counters[WAITING] % KEPT_WAVES
     s.waves[kept, 0], s.waves[kept, 1] = at, height
     s.counters[WAITING] += 1
+
+
+@compiled
+def _take_back(s: State) -> None:
+    """The last beat was none: undo what it did to intervals and levels."""
+    s.counters[LAST_BEAT] = s.counters[BEFORE_LAST]
+    s.counters[INTERVALS] = s.counters[INTERVALS_BEFORE]
+    s.counters[BEATS] -= 1
+    for k in range(len(s.leads)):
+        s.leads[k, LEVEL] = max(s.leads[k, LEVEL], s.leads[k, LEVEL_BEFORE])
+    low = min(s.numbers[LAST_HEIGHT], 0.6)
+    s.numbers[BETWEEN] += 0.25 * max(low - s.numbers[BETWEEN], 0.0)
 
 
 @compiled
@@ -271,11 +264,16 @@ def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
 
 
 @compiled
-def _is_beat(since_s: float, height: float, share: float, s: State) -> bool:
+def _is_beat(since_s: float, height: float, share: float, plan: Plan, s: State) -> bool:
     """Whether a wave so long after a beat and so high exceeds a share of the threshold."""
-    between = s.numbers[BETWEEN]
-    bar_s = LATE_T_WAVE_S if share < 1.0 else T_WAVE_S
-    if since_s < bar_s and height < 0.5 * min(s.numbers[LAST_HEIGHT], 1.6):
+    between, last = s.numbers[BETWEEN], s.numbers[LAST_HEIGHT]
+    slow = math.sqrt(max(s.numbers[USUAL_RR] / (USUAL_S * plan.rate_hz), 1.0))
+    bar_s = LATE_T_WAVE_S if share < 1.0 else min(T_WAVE_S * slow, LATE_T_WAVE_S)
+    bar = 0.5 * min(last, LARGE)
+    if since_s >= bar_s:
+        wide = s.numbers[LAST_LIKENESS] < ALIKE or last > LARGE
+        bar *= 1.0 - (since_s - bar_s) / FADE_S if wide else 0.0
+    if height < bar:
         return False
     return bool(height > between + share * THRESHOLD * (1.0 - between))
 
@@ -296,12 +294,13 @@ def _look_back(i: int, plan: Plan, s: State) -> None:
     for k in range(min(s.counters[WAITING], KEPT_WAVES)):
         since_s = (s.waves[k, 0] - s.counters[LAST_BEAT]) / plan.rate_hz
         fits = since_s >= REFRACTORY_S and i - s.waves[k, 0] >= PATIENCE_S * plan.rate_hz
-        fits = fits and _is_beat(since_s, s.waves[k, 1], 0.5, s)
+        fits = fits and _is_beat(since_s, s.waves[k, 1], 0.5, plan, s)
         if fits and (best < 0 or s.waves[k, 1] > s.waves[best, 1]):
             best = k
     if best >= 0:
         at, height = int(s.waves[best, 0]), s.waves[best, 1]
         if _resembles(at, height, 0.5, plan, s):
+            s.found[s.counters[FOUND], INSTEAD] = 0.0
             _accept(at, height, 1.0, plan, s)
             return
         s.waves[best, 1] = 0.0
@@ -331,7 +330,7 @@ def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
         # A lead that is off says nothing about how large its beats are.
         if lead[WEIGHT] <= 0.0:
             continue
-        level, noise = _levels(k, first, last, plan, s)
+        level, noise = wave_levels(k, first, last, plan, s)
         if level > CLEAR * noise:
             lead[LEVEL], lead[NOISE] = max(level, least * lead[LEVEL]), noise
 
@@ -339,9 +338,12 @@ def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
 @compiled
 def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
     """A beat: time it, learn from it, and report it."""
+    row = s.found[s.counters[FOUND]]
+    s.counters[INTERVALS_BEFORE] = s.counters[INTERVALS]
     _learn_interval(at, plan, s)
+    s.counters[BEFORE_LAST] = s.counters[LAST_BEAT]
     s.counters[LAST_BEAT] = at
-    s.numbers[LAST_HEIGHT] = height
+    s.numbers[LAST_HEIGHT], s.numbers[LAST_LIKENESS] = height, row[LIKENESS]
     kept = 0
     for k in range(min(s.counters[WAITING], KEPT_WAVES)):
         if s.waves[k, 0] > at:
@@ -350,10 +352,10 @@ def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
     s.counters[WAITING] = kept
     contrast = 0.0
     for k in range(len(s.leads)):
-        _learn_level(s.leads[k], s.energy[k, at % plan.length], late)
+        s.leads[k, LEVEL_BEFORE] = s.leads[k, LEVEL]
+        learn_level(s.leads[k], s.energy[k, at % plan.length], late)
         if s.leads[k, WEIGHT] > 0.0:
             contrast = max(contrast, s.leads[k, LEVEL] / s.leads[k, NOISE])
-    row = s.found[s.counters[FOUND]]
     row[KNOWN], row[HEIGHT], row[LATE] = s.counters[SEEN] - 1, height, late
     learn_beat(at, row, plan, s)
     s.counters[FOUND] += 1
@@ -374,15 +376,3 @@ def _learn_interval(at: int, plan: Plan, s: State) -> None:
     for k in range(count):
         mean += s.intervals[k] / count
     s.numbers[USUAL_RR] = mean
-
-
-@compiled
-def _learn_level(lead: Float, energy: float, late: float) -> None:
-    """Move the level of a lead's beats a little towards this one, in the logarithm."""
-    if energy <= 0.0:
-        return
-    if lead[LEVEL] <= 0.0:
-        lead[LEVEL], lead[NOISE] = energy, 0.2 * energy
-    elif lead[WEIGHT] > 0.0:
-        ratio = min(max(energy / lead[LEVEL], 0.5), 2.0)
-        lead[LEVEL] *= ratio ** (0.3 if late > 0.0 else 0.15)

@@ -69,14 +69,18 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
     padded = with_end_held(signal_mv, sampling_rate_hz)
     step = max(1, round(_STEP_S * sampling_rate_hz))
     found: list[RhythmBeat] = []
+    listed = False
     for start in range(0, len(padded), step):
         beats = detector.push(padded[start : start + step])
         kinds = [clock.beat(beat.time_s, beat.strange) for beat in beats]
         now_s = (min(start + step, len(padded)) - 1) / sampling_rate_hz
         valid = clock.at(now_s, detector.usable).valid
         for beat, kind in zip(beats, kinds, strict=True):
+            if beat.instead and listed:
+                found.pop()
             last_s = found[-1].time_s if found else math.nan
-            if kind is not None and beat.time_s <= (len(signal_mv) - 1) / sampling_rate_hz:
+            listed = kind is not None and beat.time_s <= (len(signal_mv) - 1) / sampling_rate_hz
+            if kind is not None and listed:
                 found.append(_row(beat, kind, valid, beat.time_s - last_s))
     return found
 

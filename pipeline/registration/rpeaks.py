@@ -58,6 +58,9 @@ class Beat:
     late: bool
     """Found only when it was overdue, or while the first beats were learnt."""
 
+    instead: bool = False
+    """Told in the place of the beat told before it, which was this one's P wave."""
+
     @property
     def strange(self) -> bool:
         """Whether it looks unlike the usual beat, as those from the ventricle do."""
@@ -134,11 +137,13 @@ class RPeakDetector:
             float(row[at.HEIGHT]),
             float(row[at.LIKENESS]),
             bool(row[at.LATE]),
+            bool(row[at.INSTEAD]),
         )
 
 
 def find_beats(signal_mv: Float, sampling_rate_hz: float) -> list[Beat]:
-    """All beats of a recording ``(n, leads)``, in order, by the detector that a stream would use.
+    """All beats of a recording ``(n, leads)``, in order, by the detector that a stream would use,
+    without those that others were told instead of.
 
     The last value is held for ``LATENCY_S``, so that the last beats become known too.
 
@@ -150,7 +155,11 @@ def find_beats(signal_mv: Float, sampling_rate_hz: float) -> list[Beat]:
     if signal_mv.ndim != 2:
         raise InputError(f"ECG: needs an array (samples, leads), got {signal_mv.shape}")
     detector = RPeakDetector(sampling_rate_hz, signal_mv.shape[1])
-    beats = detector.push(with_end_held(signal_mv, sampling_rate_hz))
+    beats: list[Beat] = []
+    for beat in detector.push(with_end_held(signal_mv, sampling_rate_hz)):
+        if beat.instead:
+            del beats[-1:]
+        beats.append(beat)
     end_s = (len(signal_mv) - 1) / sampling_rate_hz
     # The few that were overdue became known after a later one.
     return sorted((beat for beat in beats if 0 <= beat.time_s <= end_s), key=_time_of)
@@ -185,6 +194,7 @@ def _state(plan: Plan, leads: int) -> State:
     counters[at.USABLE] = 1
     numbers = np.zeros(at.NUMBERS)
     numbers[[at.BEST, at.LAST_HEIGHT, at.BETWEEN, at.USUAL_RR]] = -1, 1, 0.1, plan.rate_hz
+    numbers[at.LAST_LIKENESS] = 1
     rows = np.zeros((leads, at.LEAD_FIELDS))
     rows[:, [at.SMALLEST_STEP, at.LOWEST, at.LOWEST_OLD, at.LOWEST_OLDER, at.STILLEST]] = np.inf
     return State(

@@ -1,0 +1,57 @@
+"""Energy of a lead's beats, and of what lies between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.registration.compiled import compiled
+from pipeline.registration.detector_state import KEPT_WAVES, LEVEL, NOISE, WEIGHT, Plan, State
+
+REFRACTORY_S = 0.20
+"""No two beats are closer together."""
+
+
+@compiled
+def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float]:
+    """Energy of a lead's beats and of what lies between them, from a stretch of samples.
+
+    Beats are the highest waves; the one highest of all may be a tug at the electrode.
+    """
+    seen, waves = np.empty(last - first + 1), np.empty(KEPT_WAVES)
+    count, best, best_at = 0, 0.0, first
+    for i in range(first, last + 1):
+        seen[i - first] = s.energy[k, i % plan.length]
+        if seen[i - first] > best:
+            best, best_at = seen[i - first], i
+        elif i - best_at > REFRACTORY_S * plan.rate_hz:
+            if count < KEPT_WAVES:
+                waves[count] = best
+                count += 1
+            best, best_at = 0.0, i
+    seen.sort()
+    if count == 0:
+        return 0.8 * seen[-1], seen[int(0.7 * len(seen))]
+    found = np.sort(waves[:count])
+    high = found[found > 0.4 * found[max(0, count - 2)]]
+    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))]
+
+
+@compiled
+def follow_noise(lead: Float, energy: float, rate_hz: float) -> None:
+    """Track the energy that 7 samples in 10 stay under: QRS complexes take less than 3."""
+    step = 4.0 / rate_hz
+    lead[NOISE] *= 1.0 + 0.7 * step if energy > lead[NOISE] else 1.0 - 0.3 * step
+    lead[NOISE] = max(lead[NOISE], 0.02 * lead[LEVEL])
+
+
+@compiled
+def learn_level(lead: Float, energy: float, late: float) -> None:
+    """Move the level of a lead's beats a little towards this one, in the logarithm."""
+    if energy <= 0.0:
+        return
+    if lead[LEVEL] <= 0.0:
+        lead[LEVEL], lead[NOISE] = energy, 0.2 * energy
+    elif lead[WEIGHT] > 0.0:
+        ratio = min(max(energy / lead[LEVEL], 0.5), 2.0)
+        lead[LEVEL] *= ratio ** (0.3 if late > 0.0 else 0.15)
