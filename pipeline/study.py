@@ -276,13 +276,14 @@ def _require_names_of_folders(folder: Path, given: dict[str, Any]) -> None:
                 )
 
 
-def _require_signals(record: list[Path]) -> None:
-    """Refuse a WFDB header whose signals, or whose segments' headers, are not beside it."""
-    for header in (one for one in record if one.suffix == ".hea"):
-        for name in names_in_header(header):
-            beside = header.parent / name
-            if not beside.exists() and not beside.with_name(f"{name}.hea").exists():
-                raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
+def _require_signals(header: Path) -> None:
+    """Refuse a WFDB header whose signals, or whose segments and theirs, are not beside it."""
+    for name in names_in_header(header):
+        segment = header.parent / f"{name}.hea"
+        if segment != header and segment.is_file():
+            _require_signals(segment)
+        elif not (header.parent / name).is_file():
+            raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
 
 
 def _require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
@@ -323,7 +324,9 @@ def _require_files(study: Study) -> None:
     for stem in (study.ecg.mr, study.ecg.us):
         if stem is not None and not record_files(stem):
             raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
-        _require_signals([one for one in record_files(stem) if stem and one.stem == stem.stem])
+        for header in record_files(stem):
+            if stem and header.suffix == ".hea" and header.stem == stem.stem:
+                _require_signals(header)
     if study.us and study.ecg.us is None:
         raise InputError(
             f"{study.folder}: has tracked ultrasound but no ECG recorded with it; add ecg/us.hea "

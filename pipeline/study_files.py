@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from pathlib import Path
+from typing import NoReturn
 
 from pipeline.errors import InputError
 
@@ -14,7 +16,7 @@ LITTER = ("thumbs.db", "desktop.ini")
 
 # A MetaImage header is text; pixels may follow in the same file.
 _HEADER_BYTES = 1 << 24
-_DATA_FILE = re.compile(rb"^\s*ElementDataFile\s*[=:][ \t]*(.*?)\s*$", re.MULTILINE)
+_DATA_FILE = re.compile(rb"^[ \t]*ElementDataFile[ \t]*[=:][ \t]*(.*?)[ \t\r]*$", re.MULTILINE)
 
 
 def files_below(path: Path) -> list[Path]:
@@ -28,22 +30,45 @@ def files_below(path: Path) -> list[Path]:
         When a folder cannot be entered.
     """
     if not path.is_dir():
-        return [path] if path.is_file() else []
+        return [path] if _is_file(path) else []
     found: list[Path] = []
     entered: set[str] = set()
     for name, folders, files in os.walk(path, onerror=_refuse, followlinks=True):
-        # A link may lead back to a folder around it.
-        entered.add(os.path.realpath(name))
-        folders[:] = [one for one in folders if os.path.realpath(Path(name, one)) not in entered]
+        # Links may lead to a folder that was entered, or back to one around them.
+        place = os.path.realpath(name)
+        if place in entered:
+            folders.clear()
+            continue
+        entered.add(place)
         found += [Path(name, one) for one in files if not _is_litter(one)]
-    return sorted(one for one in found if one.is_file())
+    for one in found:
+        if one.is_symlink() and not one.exists():
+            raise InputError(f"{one}: is a link that leads nowhere; mend it, or take it out")
+    return sorted(one for one in found if _is_file(one))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        # No file has so long a name, whatever a header says.
+        if error.errno == errno.ENAMETOOLONG:
+            return False
+        _refuse(error)
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        _refuse(error)
 
 
 def _is_litter(name: str) -> bool:
     return name.startswith(".") or name.lower() in LITTER
 
 
-def _refuse(error: OSError) -> None:
+def _refuse(error: OSError) -> NoReturn:
     raise InputError(
         f"{error.filename}: cannot be entered ({error.strerror}); give yourself the right to read "
         "it, or take it out"
@@ -56,14 +81,14 @@ def record_files(stem: Path | None) -> list[Path]:
         return []
     if stem.suffix in WFDB_ENDINGS:
         stem = stem.with_suffix("")
-    beside = stem.parent.iterdir() if stem.parent.is_dir() else iter(())
-    found = {one for one in beside if one.name.startswith(stem.name) and one.is_file()}
+    beside = _in_folder(stem.parent)
+    found = {one for one in beside if one.name.startswith(stem.name) and _is_file(one)}
     headers = [stem.parent / f"{stem.name}.hea"]
     # What a header names may be segments, which have headers of their own.
     for header in headers:
         named = [header.parent / name for name in names_in_header(header)]
         segments = [one.with_name(f"{one.name}.hea") for one in named]
-        found |= {one for one in (*named, *segments) if one.is_file()}
+        found |= {one for one in (*named, *segments) if _is_file(one)}
         headers += [one for one in segments if one not in headers]
     return sorted(found)
 
@@ -76,7 +101,7 @@ def names_in_header(header: Path) -> list[str]:
     InputError
         When there is such a header, and it cannot be read.
     """
-    if not header.is_file():
+    if not _is_file(header):
         return []
     try:
         lines = header.read_text(errors="replace").splitlines()
@@ -100,7 +125,7 @@ def sweep_files(sweep: Path) -> list[Path]:
     name = named[1].decode(errors="replace") if named else "LOCAL"
     if name.upper() == "LOCAL":
         return [sweep]
-    if (sweep.parent / name).is_file():
+    if _is_file(sweep.parent / name):
         return [sweep, sweep.parent / name]
-    others = (one for one in sweep.parent.iterdir() if one.suffix.lower() not in (".mha", ".mhd"))
-    return [sweep, *sorted(one for one in others if one.is_file())]
+    others = (one for one in _in_folder(sweep.parent) if one.suffix.lower() not in (".mha", ".mhd"))
+    return [sweep, *(one for one in others if _is_file(one))]

@@ -1,4 +1,4 @@
-/* Reads rows of (what, time, flag): what 0 is a beat, what 1 a question. Writes what came back. */
+/* Reads rows of (what, time, flag): what 0 is a beat, 1 a question, 2 takes a beat back. Writes what came back. */
 #include <stdio.h>
 
 #define BEATFIELD_CLOCK_IMPLEMENTATION
@@ -15,6 +15,8 @@ int main(void)
         double out[6] = {0, 0, 0, 0, 0, 0};
         if (row[0] == 0.0) {
             out[0] = (double)bf_beat(&clock, row[1], row[2] > 0.0);
+        } else if (row[0] == 2.0) {
+            bf_take_back(&clock);
         } else {
             bf_tick tick;
             out[0] = bf_now(&clock, row[1], row[2] > 0.0, &tick);

@@ -261,3 +261,41 @@ def test_endings_may_be_capitals(tmp_path: Path) -> None:
 def test_timing_without_its_images_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds timing\.json, but no NIfTI file"):
         open_study(study_of(tmp_path, "cine/timing.json"))
+
+
+def nifti_bytes() -> bytearray:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4, 5), np.int16), np.diag([1, 1, 8, 1.0]))
+    image.set_qform(image.affine, 1)
+    image.set_sform(None, 0)
+    return bytearray(image.to_bytes())
+
+
+def with_numbers(offset: int, values: list[float]) -> bytearray:
+    """The header's numbers from ``offset`` on (nifti1.h) in single precision."""
+    content = nifti_bytes()
+    content[offset : offset + 4 * len(values)] = np.array(values, "<f4").tobytes()
+    return content
+
+
+def of_datatype(code: int, bits: int) -> bytearray:
+    content = nifti_bytes()
+    content[70:74] = np.array([code, bits], "<i2").tobytes()
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (with_numbers(112, [0.5, np.nan]), "cannot be read as NIfTI"),
+        (with_numbers(256, [0.9, 0.9, 0.9]), "cannot be read as NIfTI"),
+        (of_datatype(9999, 16), "cannot be read as NIfTI"),
+        (of_datatype(128, 24), "voxels are colours"),
+    ],
+    ids=["intercept", "quaternion", "datatype", "RGB"],
+)
+def test_a_nifti_header_without_sense_is_refused(
+    tmp_path: Path, content: bytearray, words: str
+) -> None:
+    (tmp_path / "cine.nii").write_bytes(content)
+    with pytest.raises(InputError, match=rf"cine\.nii: .*{words}"):
+        read_nifti_cine(tmp_path / "cine.nii", None, 900.0)

@@ -42,7 +42,7 @@ def test_compiles_without_a_warning(tmp_path, compiler, standard, language):
 
 def stream(rng: np.random.Generator) -> np.ndarray:
     """Beats and questions in turn: ramps, early beats, disorder, pauses, lost leads, times back,
-    and beats of another clock, before the first question too."""
+    beats taken back, and beats of another clock, before the first question too."""
     rows = [(0, 500.0 + rng.uniform(), False)] if rng.random() < 0.5 else []
     r_s, now_s, rr_s = 0.3, 0.0, float(rng.uniform(0.4, 1.2))
     for _ in range(120):
@@ -57,7 +57,11 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             rows.append((1, now_s - 5.0, True))
         if mood == 7:
             rows.append((0, r_s + 1000.0, False))
+        if mood == 9:
+            rows += [(0, r_s - 0.15, False), (2, r_s, False)]
         rows.append((0, r_s - (2.0 if mood == 6 else 0.0), rng.random() < 0.1))
+        if mood == 6:
+            rows.append((2, r_s, False))
         if mood == 8:
             rows.append((0, r_s + rng.uniform(2.5, 3.5), False))
         r_s += step_s
@@ -72,6 +76,8 @@ def by_python(rows: np.ndarray, cycle_rr_s: float) -> np.ndarray:
     for row, (what, time_s, flag) in zip(out, rows, strict=True):
         if what == 0:
             row[0] = ticks.beat(c, time_s, bool(flag))
+        elif what == 2:
+            clock.take_back()
         else:
             row[0] = ticks.advance(c, time_s, bool(flag))
             row[1:] = c[[ticks.PHASE, ticks.SD, ticks.STATE, ticks.VALID, ticks.FADE]]

@@ -117,7 +117,15 @@ def test_a_micro_sign_is_told_before_microvolts_are_taken_for_volts(tmp_path, si
     header.write_bytes(header.read_bytes().replace(b"uV", sign))
     with pytest.raises(InputError, match=r"micro sign.*write uV"):
         read_ecg(stem)
-    header.write_bytes(header.read_bytes().replace(sign, b"uV") + b"# by M\xc3\xb5ller\n")
+    with_segments = stem.with_name("whole.hea")
+    with_segments.write_text(f"whole/1 2 {RATE_HZ} 1000\n{stem.name} 1000\n")
+    with pytest.raises(InputError, match=r"micro sign.*write uV"):
+        read_ecg(with_segments)
+    # Elsewhere the same bytes are letters.
+    named = (
+        header.read_bytes().replace(sign, b"uV").replace(b" I\n", b" I \xe5\xbf\x83\xe7\x94\xb5\n")
+    )
+    header.write_bytes(named + b"# by M\xc3\xb5ller\n")
     np.testing.assert_allclose(read_ecg(stem).signal_mv, STEPS_UV / 1e6, rtol=1e-9)
 
 

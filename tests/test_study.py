@@ -234,7 +234,13 @@ def test_folders_behind_links_are_read_and_closed_ones_told(tmp_path: Path) -> N
     (elsewhere / "round").symlink_to(folder / "cine")
     found = open_study(folder).input_files()["cine"]
     assert folder.resolve() / "cine" / "slice" / "image" in found
+    (folder / "cine" / "again").symlink_to(folder / "cine" / "slice")
+    assert len(open_study(folder).input_files()["cine"]) == len(found)
     assert len({path.resolve() for path in found}) == len(found)
+    (folder / "cine" / "lost").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="lost: is a link that leads nowhere"):
+        open_study(folder)
+    (folder / "cine" / "lost").unlink()
 
     def closed(*_: object, onerror: Callable[[OSError], None], **__: object) -> Iterator[None]:
         onerror(PermissionError(13, "Permission denied", str(folder / "cine")))

@@ -99,6 +99,10 @@ def test_compressed_pixels_of_unknown_length_are_refused(tmp_path):
     path.write_bytes(re.sub(rb"CompressedDataSize = \d+\n", b"", path.read_bytes()))
     with pytest.raises(InputError, match=r"does not say how long its compressed pixels are"):
         read_sweep(path)
+    # A file of their own is as long as they are.
+    path = write(tmp_path / "s.mhd", good_fields(), compress=True)
+    path.write_bytes(re.sub(rb"CompressedDataSize = \d+\n", b"", path.read_bytes()))
+    np.testing.assert_array_equal(read_sweep(path).images, PIXELS)
 
 
 def test_calibration_may_stand_once_for_the_file(tmp_path):

@@ -15,6 +15,7 @@ from pipeline.errors import InputError
 from pipeline.field import ForceField
 from pipeline.imaging.ecg import Ecg, read_ecg
 from pipeline.registration.clock import PhaseClock
+from pipeline.registration.rhythm import tell
 from pipeline.registration.rpeaks import RPeakDetector
 
 RATE_HZ = 1000
@@ -34,7 +35,7 @@ def serve(field: ForceField, ecg: Ecg, tip_mm: tuple[float, float, float]) -> It
         passed_s = turn / RATE_HZ
         arrived = 1 + int(passed_s * ecg.sampling_rate_hz + 1e-6)
         for beat in detector.push(ecg.signal_mv[seen:arrived]):
-            clock.beat(beat.time_s, beat.strange)
+            tell(clock, beat)
         seen = arrived
         tick = clock.at(passed_s, detector.usable)
         force_n = field.force_at(*tip_mm, tick.phase, fixture)

@@ -16,13 +16,11 @@ from pipeline.imaging.frames import (
     MIN_SLICES,
     NEAREST_SLICES_MM,
     Frame,
-    LeftOut,
     choose_stack,
-    describe,
-    left_out_lines,
     slice_positions,
     stacks_beside,
 )
+from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.spacing import fill_gaps, regular_steps
 
 PLAUSIBLE_RR_S = (0.2, 3.0)
@@ -111,9 +109,9 @@ def stack_frames(
     chosen, left_out = choose_stack(frames, where)
     _require_timing(chosen)
     slices, time_name = _in_time(_slices_in_order(chosen), where)
-    _require_complete(slices, where)
     lines = left_out_lines([*left_out, *others], where)
     try:
+        _require_complete(slices, where)
         step_mm, numbers = regular_steps(slices, where, fill)
     except InputError as error:
         # A slice that is missed may be there, and be none of the stack for a reason.
@@ -125,7 +123,7 @@ def stack_frames(
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
-    doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen)
+    doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen, where)
     return Stack(cine, triggers, rr_ms, source, lines, doubts)
 
 
@@ -244,11 +242,11 @@ def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[F
         name = names[0]
         ordered = _sorted_by(slices, name)
     _require_given_once(ordered, name, where)
-    for tie in (_tie(one, name) for one in ordered):
-        if tie:
+    for one in ordered:
+        if tie := _tie(one, name):
             raise InputError(
                 f"{where}: {tie[0].where} and {tie[1].where} show the same slice at the same "
-                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(*tie)}"
+                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(one, name)}"
             )
     return ordered, name
 
@@ -271,12 +269,13 @@ def _shared_time_names(slices: Sequence[Sequence[Frame]], where: str) -> list[st
     return names
 
 
-def _remedy(first: Frame, second: Frame) -> str:
-    if first.series_uid != second.series_uid:
+def _remedy(one: Sequence[Frame], name: str) -> str:
+    """What to do about frames of a slice that have the same time."""
+    if len({frame.times_ms[name] for frame in one}) > 1:
         return "keep one series a slice"
     return (
-        "one series gives both, so its trigger times do not tell its phases apart: export them "
-        "with TriggerTime (0018,1060), or give the cine as NIfTI with a timing file"
+        "its times do not tell its phases apart: export them with TriggerTime (0018,1060), or give "
+        "the cine as NIfTI with a timing file"
     )
 
 

@@ -14,7 +14,8 @@ from pydicom.misc import is_dicom
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
-from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame, LeftOut, left_out_lines
+from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
+from pipeline.imaging.left_out import LeftOut, left_out_lines
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
 from pipeline.study_files import files_below
 
@@ -27,8 +28,8 @@ MR_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
     "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
 }
-DIRECTORY = "1.2.840.10008.1.3.10"
-"""Media Storage Directory Storage: DICOMDIR, however a system spells its name."""
+DIRECTORY, DIRECTORY_NAMES = "1.2.840.10008.1.3.10", ("DICOMDIR", "DICOMDIR;1")
+"""Media Storage Directory Storage, and what systems make of its file's name."""
 
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
@@ -66,7 +67,7 @@ def read_dicom_study(
     ``fill`` lets the mean of both neighbours stand in for a slice that is missing.
     Which images are such views, `pipeline.imaging.long_axis_series.long_axis_views` says.
     """
-    paths = files_below(folder)
+    paths = [path for path in files_below(folder) if path.name.upper() not in DIRECTORY_NAMES]
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
     _require_dicom(paths)
@@ -135,6 +136,9 @@ def _other_object(dataset: Any) -> str | None:
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"
     placed = "ImagePositionPatient" in dataset or "PerFrameFunctionalGroupsSequence" in dataset
+    together = int(dataset.get("NumberOfFrames", 1) or 1)
+    if together > 1 and "PerFrameFunctionalGroupsSequence" not in dataset:
+        placed = False
     # An original MR image without a place may be one of the cine's, spoilt by an export.
     doubtful = sop_class in MR_CLASSES and _kind(dataset, pydicom.Dataset()) != DERIVED
     return None if placed or doubtful else f"{name}, without a place in space"
@@ -211,9 +215,12 @@ def _syntax(dataset: Any) -> Any:
 def _read_by_gdcm(dataset: Any, path: Path) -> Any:
     """Stored values of one compressed classic image, by a library that knows more ways, or None.
 
-    That library gives rescaled values: the stored ones are found again from them.
+    That library gives rescaled values: the stored ones are found again from them. What it makes
+    of white for black differs with the encoding, so that is not asked of it.
     """
-    if not _syntax(dataset).is_compressed or "PerFrameFunctionalGroupsSequence" in dataset:
+    plain = dataset.get("PhotometricInterpretation") == "MONOCHROME2"
+    enhanced = "PerFrameFunctionalGroupsSequence" in dataset
+    if enhanced or not plain or not _syntax(dataset).is_compressed:
         return None
     import SimpleITK as sitk
 
@@ -234,7 +241,7 @@ def _upright(stored: Any, dataset: Any) -> Any:
         return stored
     most = 2 ** int(dataset.BitsStored) - 1
     # Complement of two: the largest is one less than the smallest's magnitude.
-    return (-1 if int(dataset.get("PixelRepresentation", 0)) else most) - stored.astype(np.int64)
+    return (-1 if int(dataset.get("PixelRepresentation", 0)) else most) - stored.astype(np.int32)
 
 
 def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None) -> Frame:
@@ -331,6 +338,7 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
         (timing, "RRIntervalTimeNominal"),
         (timing, "HeartRate"),
         (dataset, "CardiacRRIntervalSpecified"),
+        (dataset, "HeartRate"),
     ):
         if _given(item, name) and float(item.get(name)) > 0:
             value = float(item.get(name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,12 +15,14 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
+from pipeline.study_files import names_in_header
 
 MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
 """Millivolts in one unit, by its name in lower case."""
 
-MICRO_SIGNS = (b"\xb5", b"\xce\xbc")
-"""In Latin-1 and in UTF-8 (where the first follows another byte), and the Greek letter."""
+MICRO_UNIT = re.compile(rb"^[^#\s]\S*\s+\S+\s+\S*/\S*?(?:\xb5|\xce\xbc)", re.MULTILINE)
+"""A signal's line whose unit, after file and format, has a micro sign (Latin-1 or UTF-8, where
+another byte stands before it) or the Greek letter."""
 
 # Samples a second of an ECG: no two units of time that are a thousandfold apart both fit.
 _RATES_HZ = (100.0, 2000.0)
@@ -96,10 +99,12 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
     """Read a record by its ``.hea`` file."""
     if not header.is_file():
         raise InputError(f"{header}: no such file; a WFDB record needs its .hea and .dat files")
-    _require_plain_units(header)
     try:
+        _require_plain_units(header)
         with _quiet_wfdb() as wfdb:
             record = wfdb.rdrecord(str(header.with_suffix("").absolute()), return_res=64)
+    except InputError:
+        raise
     # The library raises its parser's own errors (IndexError, TypeError ...) on damaged files.
     except Exception as error:
         raise InputError(
@@ -111,11 +116,12 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
 
 def _require_plain_units(header: Path) -> None:
     """Refuse a micro sign, which the library passes over: microvolts would be read as volts."""
-    lines = header.read_bytes().splitlines()
-    if any(mu in line for line in lines if not line.startswith(b"#") for mu in MICRO_SIGNS):
-        raise InputError(
-            f"{header}: has a unit with a micro sign, which a WFDB header cannot hold; write uV"
-        )
+    segments = (header.parent / f"{name}.hea" for name in names_in_header(header))
+    for one in (header, *(path for path in segments if path.is_file())):
+        if MICRO_UNIT.search(one.read_bytes()):
+            raise InputError(
+                f"{one}: has a unit with a micro sign, which a WFDB header cannot hold; write uV"
+            )
 
 
 def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:

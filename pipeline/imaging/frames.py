@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
+from pipeline.imaging.left_out import LeftOut, inside
 
 MIN_SLICES = 3
 MIN_PHASES = 2
@@ -85,17 +86,6 @@ class Frame:
         rows, columns = self.pixels.shape
         half = np.array([columns - 1, rows - 1]) / 2 * self.spacing_mm
         return np.asarray(self.position_mm + half @ self.axes)
-
-
-@dataclass(frozen=True, slots=True)
-class LeftOut:
-    """One file or frame that is not part of the stack."""
-
-    where: str
-    series: str
-    series_uid: str
-    reason: str
-    noun: str = "image"
 
 
 def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list[LeftOut]]:
@@ -198,34 +188,40 @@ def _parallel(first: Frame, frame: Frame) -> bool:
     return abs(float(first.normal @ frame.normal)) > PARALLEL_COSINE
 
 
-def _moments(frames: Sequence[Frame]) -> dict[int, int]:
-    """Number of different times that each slice shows, by the slice's place in the set."""
+def _by_slice(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """The frames of each slice of the set."""
     slices_mm = slice_positions(frames) - NEAREST_SLICES_MM / 2
-    times: dict[int, set[tuple[float, ...]]] = {}
+    slices: list[list[Frame]] = [[] for _ in slices_mm]
     for frame in frames:
         along_mm = float(frame.middle_mm @ frames[0].normal)
-        number = int(np.searchsorted(slices_mm, along_mm))
-        times.setdefault(number, set()).add(tuple(frame.times_ms.values()))
-    return {number: len(found) for number, found in times.items()}
+        slices[int(np.searchsorted(slices_mm, along_mm)) - 1].append(frame)
+    return slices
+
+
+def _moments(frames: Sequence[Frame]) -> list[int]:
+    """Number of different times that each slice shows."""
+    return [len({tuple(frame.times_ms.values()) for frame in one}) for one in _by_slice(frames)]
 
 
 def _is_cine(frames: Sequence[Frame]) -> bool:
     """Whether most of the slices are seen at two moments or more, of different parts of a beat."""
-    many = float(np.median(list(_moments(frames).values()))) >= MIN_PHASES
-    return many and _spans_beat(frames)
+    return float(np.median(_moments(frames))) >= MIN_PHASES and _spans_beat(frames)
 
 
 def _spans_beat(frames: Sequence[Frame]) -> bool:
-    """Whether the times tell of a beat rather than of nearly one moment, as those of perfusion and
-    mapping do, which show a slice many times."""
-    first_ms, last_ms = _time_range_ms(frames)
+    """Whether most slices are seen through a beat rather than at nearly one moment of it, as in
+    perfusion and mapping, which show a slice many times."""
     beat_ms = next((frame.rr_ms for frame in frames if frame.rr_ms), USUAL_RR_MS)
-    return last_ms - first_ms >= LEAST_OF_A_BEAT * beat_ms
+    spans_ms = [last_ms - first_ms for first_ms, last_ms in map(_time_range_ms, _by_slice(frames))]
+    return float(np.median(spans_ms)) >= LEAST_OF_A_BEAT * beat_ms
 
 
-def _time_range_ms(frames: Iterable[Frame]) -> tuple[float, float]:
-    times_ms = [next(iter(frame.times_ms.values()), 0.0) for frame in frames]
-    return min(times_ms), max(times_ms)
+def _time_range_ms(frames: Sequence[Frame]) -> tuple[float, float]:
+    """First and last time by the attribute that tells the frames furthest apart."""
+    names = set(frames[0].times_ms).intersection(*(frame.times_ms for frame in frames))
+    times_ms = [[frame.times_ms[name] for frame in frames] for name in names] or [[0.0]]
+    widest = max(times_ms, key=np.ptp)
+    return min(widest), max(widest)
 
 
 def is_stack(frames: Sequence[Frame]) -> bool:
@@ -233,13 +229,14 @@ def is_stack(frames: Sequence[Frame]) -> bool:
     return _is_cine(frames) and len(slice_positions(frames)) >= MIN_SLICES
 
 
-def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame]) -> tuple[str, ...]:
+def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame], folder: str) -> tuple[str, ...]:
     """Which other original images would make up a cine stack of another direction, in words."""
-    others = [one for one in _alike(frames) if is_stack(one) and one[0].kind == ORIGINAL]
+    others = [one for one in _alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
     return tuple(
-        f"{one[0].series} ({one[0].where}, ...) is a cine of {len(slice_positions(one))} slices "
-        f"too, in another direction than {stack[0].series}, which was taken for its "
-        f"{len(stack)} images: if that is not the short axis, leave it out of the folder"
+        f"{one[0].series} ({inside(one[0].where, folder)}, ...) is a cine of "
+        f"{len(slice_positions(one))} slices too, in another direction than {stack[0].series}, "
+        f"which was taken for its {len(stack)} images: if that is not the short axis, leave it out "
+        "of the folder"
         for one in others
         if not _parallel(stack[0], one[0])
     )
@@ -247,15 +244,20 @@ def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame]) -> tuple[str,
 
 def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
     """Sets of images alike, each with its rank, the first one first."""
-    stacks = [one for one in sets if is_stack(one)]
+    stacks = [one for one in sets if is_stack(one) and one[0].kind in (ORIGINAL, DERIVED)]
     ranked = []
     for one in sets:
-        along = [len(other) for other in stacks if _parallel(one[0], other[0])]
+        along = [_weight(other) for other in stacks if _parallel(one[0], other[0])]
         per_mm2 = 1 / (one[0].spacing_mm[0] * one[0].spacing_mm[1])
         enough = any(one is other for other in stacks)
         original = one[0].kind == ORIGINAL
         ranked.append(((enough, max(along, default=0), original, len(one), per_mm2), one))
     return sorted(ranked, key=_first, reverse=True)
+
+
+def _weight(frames: Sequence[Frame]) -> int:
+    """Images of a stack; derived ones count half beside those of another direction."""
+    return len(frames) // (1 if frames[0].kind == ORIGINAL else 2)
 
 
 def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str) -> None:
@@ -274,37 +276,42 @@ def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
     by_series: dict[str, list[Frame]] = {}
     for frame in frames:
         by_series.setdefault(frame.series_uid, []).append(frame)
-    moving = [one for one in by_series.values() if _most_moments(one) > 1 and _spans_beat(one)]
-    cine = [frame for one in moving for frame in one]
-    stills = {name for name, one in by_series.items() if cine and _is_still(one, cine)}
+    single = {name for name, one in by_series.items() if max(_moments(one)) < MIN_PHASES}
+    moving = {name for name, one in by_series.items() if name not in single and _spans_beat(one)}
+    cine = [frame for frame in frames if frame.series_uid in moving]
+    if not cine:
+        return list(frames), []
+    slices_mm, normal = slice_positions(cine), cine[0].normal
+    elsewhere = {name for name in single if not _covered(by_series[name], normal, slices_mm)}
+    # A cine may be stored with a series for each phase, and some of its slices otherwise.
+    beyond = [frame for frame in frames if frame.series_uid in elsewhere]
+    if beyond and _is_cine(beyond):
+        single -= elsewhere
+    else:
+        single -= {name for name in elsewhere if len(slice_positions(by_series[name])) == 1}
+    short = by_series.keys() - moving - single - elsewhere
+    stills = single | {name for name in short if _within(by_series[name], cine, slices_mm)}
     return (
         [frame for frame in frames if frame.series_uid not in stills],
         [frame for frame in frames if frame.series_uid in stills],
     )
 
 
-def _is_still(series: Sequence[Frame], cine: Sequence[Frame]) -> bool:
-    """Whether a series shows one moment, of several slices or of slices that cines show, or many
-    within a small part of the beat that cines show of these slices."""
-    slices_mm, normal = slice_positions(cine), cine[0].normal
-    covered = _covered(series, normal, slices_mm)
-    if _most_moments(series) < MIN_PHASES:
-        return covered or len(slice_positions(series)) > 1
-    if _spans_beat(series) or not covered:
+def _within(series: Sequence[Frame], cine: Sequence[Frame], slices_mm: Float) -> bool:
+    """Whether a series lies within what a cine shows of its slices, in place and time. A slice that
+    is stored in pieces has the rest of its times elsewhere."""
+    normal = cine[0].normal
+    if not _covered(series, normal, slices_mm):
         return False
-    # A slice that is stored in pieces has the rest of its times elsewhere.
-    along_mm = np.array([float(frame.middle_mm @ normal) for frame in series])
+    near_mm = _half_step_mm(slices_mm)
+    places_mm = slice_positions(series) * float(np.sign(series[0].normal @ normal))
     beside = [
         frame
         for frame in cine
-        if np.abs(along_mm - float(frame.middle_mm @ normal)).min() < _half_step_mm(slices_mm)
+        if np.abs(places_mm - float(frame.middle_mm @ normal)).min() < near_mm
     ]
     (first_ms, last_ms), (start_ms, end_ms) = _time_range_ms(series), _time_range_ms(beside)
     return start_ms <= first_ms and last_ms <= end_ms
-
-
-def _most_moments(frames: Sequence[Frame]) -> int:
-    return max(_moments(frames).values())
 
 
 def _half_step_mm(slices_mm: Float) -> float:
@@ -324,7 +331,7 @@ def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> st
     if not _parallel(first, other):
         angle = np.degrees(np.arccos(min(abs(float(first.normal @ other.normal)), 1.0)))
         return f"not parallel to the stack, turned by {angle:.0f} degrees"
-    if _most_moments(others) < MIN_PHASES:
+    if max(_moments(others)) < MIN_PHASES:
         return "one moment a slice, no cine"
     if not _spans_beat(others):
         return "all at nearly one moment of the beat, no cine"
@@ -363,22 +370,3 @@ def _refuse(first: Frame, other: Frame, where: str) -> None:
 
 def _spared(frames: Iterable[Frame], reason: str) -> list[LeftOut]:
     return [LeftOut(frame.where, frame.series, frame.series_uid, reason) for frame in frames]
-
-
-def left_out_lines(left_out: Iterable[LeftOut], folder: str) -> tuple[str, ...]:
-    """One line a series and reason, in the order of the files, which are named from ``folder``."""
-    groups: dict[tuple[str, str, str, str], list[str]] = {}
-    for one in sorted(left_out, key=lambda one: one.where):
-        name = one.where.removeprefix(folder).lstrip("/\\")
-        groups.setdefault((one.series_uid, one.series, one.reason, one.noun), []).append(name)
-    return tuple(
-        f"{series}: {describe(names, noun)}: {reason}"
-        for (_, series, reason, noun), names in groups.items()
-    )
-
-
-def describe(names: Sequence[str], noun: str = "image") -> str:
-    """How many there are, and where the first of them is."""
-    if len(names) == 1:
-        return f"1 {noun} ({names[0]})"
-    return f"{len(names)} {noun}s (the first is {names[0]})"

@@ -10,8 +10,9 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.frames import Frame
 
-NEARLY_ONE = 0.4
-"""A step of less than this share of the usual one: with single slices missing it is half of it."""
+NEARLY_ONE, NEARLY_ONE_MM = 0.4, 4.0
+"""A step of less than this share of the median one, and than this, is none: with slices missing the
+step may be half of the median or less."""
 
 WIDEST_GAP_MM = 25.0
 """Across a wider gap nothing is interpolated: an apex or a valve plane would fit in it."""
@@ -78,12 +79,12 @@ def regular_steps(
 
 def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, where: str) -> None:
     """Refuse a slice that was taken again beside its first place."""
-    short = np.flatnonzero(lengths_mm < NEARLY_ONE * np.median(lengths_mm))
+    short = np.flatnonzero(lengths_mm < min(NEARLY_ONE * np.median(lengths_mm), NEARLY_ONE_MM))
     if len(short):
         first, second = (slices[short[0] + k][0] for k in (0, 1))
         raise InputError(
             f"{where}: slices {short[0]} and {short[0] + 1} lie {lengths_mm[short[0]]:.2f} mm "
-            f"apart, most others {np.median(lengths_mm):.2f} mm: nearly the same slice is given "
+            f"apart, others {np.median(lengths_mm):.2f} mm: nearly the same slice is given "
             f"twice, by {first.series} ({first.where}) and by {second.series} ({second.where}); "
             "keep one"
         )

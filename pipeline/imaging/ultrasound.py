@@ -158,7 +158,8 @@ def _require_all_bytes(path: Path) -> None:
     if not pixels.is_file():
         raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
     packed = header.get("CompressedData", "False").upper() == "TRUE"
-    if packed and _number(header.get("CompressedDataSize")) is None:
+    # Of a file of its own the library takes all there is.
+    if packed and pixels == path and _number(header.get("CompressedDataSize")) is None:
         raise InputError(
             f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
             "it again, or uncompressed"

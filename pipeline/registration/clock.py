@@ -107,6 +107,14 @@ class PhaseClock:
         kind = ticks.beat(self._state, float(r_time_s), bool(strange))
         return KINDS[kind] if kind >= 0 else None
 
+    def take_back(self) -> None:
+        """The last beat was none, as a P wave that its R followed (`rpeaks.Beat.instead`).
+
+        To be told at once, before the beat that shows it. The clock knows what it knew before; the
+        phase that it gave since is corrected as any other that is off.
+        """
+        ticks.take_back(self._state)
+
     def at(self, now_s: float, usable: bool = True) -> Tick:
         """Phase now.
 

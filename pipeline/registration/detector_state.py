@@ -12,9 +12,10 @@ TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, INSTEAD, FIELDS = range(8)
 (
     LEVEL, NOISE, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
     SIGN, SCATTER, LEAN, LEAN_NOW, PEAK, FINER, HEIGHT_MV,
-    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END,
-    LEVEL_BEFORE, LEAD_FIELDS,
-) = range(27)  # fmt: skip
+    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END, LEAD_FIELDS,
+) = range(26)  # fmt: skip
+LEARNT_OF_BEATS = (LEVEL, WAY, OFFSET, SHIFT, TIMED, SIZE, SCATTER, LEAN)
+"""What a beat changes of a lead."""
 # Counters.
 (
     SEEN,
@@ -28,10 +29,8 @@ TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, INSTEAD, FIELDS = range(8)
     LEARN_AT,
     USABLE,
     BEATS,
-    BEFORE_LAST,
-    INTERVALS_BEFORE,
     COUNTERS,
-) = range(14)
+) = range(12)
 # Numbers.
 BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, LAST_LIKENESS, NUMBERS = range(6)
 KEPT_INTERVALS, KEPT_WAVES = 8, 64
@@ -53,6 +52,16 @@ class Plan(NamedTuple):
     """How long a wave must stay the highest."""
     learn: int
     """How much is seen before the first decision."""
+
+
+class Learnt(NamedTuple):
+    """What was known before the latest beat, to be restored where that was none."""
+
+    leads: Float
+    shapes: Float
+    intervals: Float
+    counters: Integer
+    numbers: Float
 
 
 class State(NamedTuple):
@@ -83,3 +92,4 @@ class State(NamedTuple):
     found: Float
     counters: Integer
     numbers: Float
+    before: Learnt

@@ -20,7 +20,6 @@ from pipeline.registration.compiled import compiled
 from pipeline.registration.detector_state import (
     BAD_UNTIL,
     BEATS,
-    BEFORE_LAST,
     BEST,
     BEST_AT,
     BETWEEN,
@@ -28,7 +27,6 @@ from pipeline.registration.detector_state import (
     HEIGHT,
     INSTEAD,
     INTERVALS,
-    INTERVALS_BEFORE,
     KEPT_INTERVALS,
     KEPT_WAVES,
     KNOWN,
@@ -39,12 +37,13 @@ from pipeline.registration.detector_state import (
     LATE,
     LEARN_AT,
     LEARNT,
+    LEARNT_OF_BEATS,
     LEVEL,
-    LEVEL_BEFORE,
     LIKENESS,
     NOISE,
     RUN,
     SEEN,
+    STRANGE,
     USABLE,
     USUAL_RR,
     WAITING,
@@ -56,9 +55,10 @@ from pipeline.registration.levels import REFRACTORY_S, follow_noise, learn_level
 from pipeline.registration.quality import RUN_S, SETTLE_S, shows_nothing, watch
 from pipeline.registration.waves import ALIKE, learn_beat, measure_beat
 
-AHEAD_S, AHEAD, LOW = 0.25, 2.0, 0.7
+AHEAD_S, AHEAD, LOW, OWN = 0.25, 2.0, 0.7, 0.98
 """A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
-ventricle beats twice in that time."""
+ventricle beats twice in that time. Unless it looks just like a beat: P waves taken for beats are
+0.90 to 0.98 like them, and a tug at the electrode may follow a small beat."""
 T_WAVE_S, USUAL_S = 0.36, 0.8
 """Until so long after a beat a wave of less than half its energy is that beat's T wave; where the
 usual RR interval is longer than so, later by its root (Bazett, Heart 7:353-370, 1920)."""
@@ -215,7 +215,8 @@ def _height(i: int, plan: Plan, s: State) -> float:
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
     since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
-    ahead = since_s < AHEAD_S and s.counters[BEATS] > 1 and s.numbers[LAST_HEIGHT] < LOW
+    low = s.numbers[LAST_HEIGHT] < LOW and s.numbers[LAST_LIKENESS] < OWN
+    ahead = since_s < AHEAD_S and s.counters[BEATS] > 1 and low
     if since_s < REFRACTORY_S and not ahead:
         return
     # Leads that turned out to be lost since then no longer count.
@@ -223,12 +224,13 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     height = _height(at, plan, s)
     instead = ahead and height > AHEAD * s.numbers[LAST_HEIGHT]
     if instead:
-        since_s = (at - s.counters[BEFORE_LAST]) / plan.rate_hz
+        since_s = (at - s.before.counters[LAST_BEAT]) / plan.rate_hz
     if since_s < REFRACTORY_S:
         return
     if _is_beat(since_s, height, 1.0, plan, s) and _resembles(at, height, 1.0, plan, s):
         if instead:
             _take_back(s)
+            measure_beat(at, s.found[s.counters[FOUND]], plan, s)
         s.found[s.counters[FOUND], INSTEAD] = 1.0 if instead else 0.0
         _accept(at, height, 0.0, plan, s)
         return
@@ -240,14 +242,27 @@ def _judge(at: int, plan: Plan, s: State) -> None:
 
 @compiled
 def _take_back(s: State) -> None:
-    """The last beat was none: undo what it did to intervals and levels."""
-    s.counters[LAST_BEAT] = s.counters[BEFORE_LAST]
-    s.counters[INTERVALS] = s.counters[INTERVALS_BEFORE]
-    s.counters[BEATS] -= 1
-    for k in range(len(s.leads)):
-        s.leads[k, LEVEL] = max(s.leads[k, LEVEL], s.leads[k, LEVEL_BEFORE])
+    """The last beat was none: know what was known before it, and that such a wave is no beat."""
     low = min(s.numbers[LAST_HEIGHT], 0.6)
     s.numbers[BETWEEN] += 0.25 * max(low - s.numbers[BETWEEN], 0.0)
+    for number in (LAST_HEIGHT, LAST_LIKENESS, USUAL_RR):
+        s.numbers[number] = s.before.numbers[number]
+    for counter in (LAST_BEAT, BEATS, INTERVALS, STRANGE):
+        s.counters[counter] = s.before.counters[counter]
+    for column in LEARNT_OF_BEATS:
+        s.leads[:, column] = s.before.leads[:, column]
+    s.shapes[:] = s.before.shapes
+    s.intervals[:] = s.before.intervals
+
+
+@compiled
+def _keep(s: State) -> None:
+    """Keep what is known before a beat, should it be none."""
+    s.before.leads[:] = s.leads
+    s.before.shapes[:] = s.shapes
+    s.before.intervals[:] = s.intervals
+    s.before.counters[:] = s.counters
+    s.before.numbers[:] = s.numbers
 
 
 @compiled
@@ -339,9 +354,8 @@ def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
 def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
     """A beat: time it, learn from it, and report it."""
     row = s.found[s.counters[FOUND]]
-    s.counters[INTERVALS_BEFORE] = s.counters[INTERVALS]
+    _keep(s)
     _learn_interval(at, plan, s)
-    s.counters[BEFORE_LAST] = s.counters[LAST_BEAT]
     s.counters[LAST_BEAT] = at
     s.numbers[LAST_HEIGHT], s.numbers[LAST_LIKENESS] = height, row[LIKENESS]
     kept = 0
@@ -352,7 +366,6 @@ def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
     s.counters[WAITING] = kept
     contrast = 0.0
     for k in range(len(s.leads)):
-        s.leads[k, LEVEL_BEFORE] = s.leads[k, LEVEL]
         learn_level(s.leads[k], s.energy[k, at % plan.length], late)
         if s.leads[k, WEIGHT] > 0.0:
             contrast = max(contrast, s.leads[k, LEVEL] / s.leads[k, NOISE])

@@ -72,7 +72,7 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
     listed = False
     for start in range(0, len(padded), step):
         beats = detector.push(padded[start : start + step])
-        kinds = [clock.beat(beat.time_s, beat.strange) for beat in beats]
+        kinds = [tell(clock, beat) for beat in beats]
         now_s = (min(start + step, len(padded)) - 1) / sampling_rate_hz
         valid = clock.at(now_s, detector.usable).valid
         for beat, kind in zip(beats, kinds, strict=True):
@@ -83,6 +83,13 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
             if kind is not None and listed:
                 found.append(_row(beat, kind, valid, beat.time_s - last_s))
     return found
+
+
+def tell(clock: PhaseClock, beat: Beat) -> Kind | None:
+    """Tell a clock of a beat that the detector found; what kind of beat it is, None if none."""
+    if beat.instead:
+        clock.take_back()
+    return clock.beat(beat.time_s, beat.strange)
 
 
 def _row(beat: Beat, kind: Kind, valid: bool, rr_s: float) -> RhythmBeat:

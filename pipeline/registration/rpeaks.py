@@ -195,16 +195,19 @@ def _state(plan: Plan, leads: int) -> State:
     numbers = np.zeros(at.NUMBERS)
     numbers[[at.BEST, at.LAST_HEIGHT, at.BETWEEN, at.USUAL_RR]] = -1, 1, 0.1, plan.rate_hz
     numbers[at.LAST_LIKENESS] = 1
-    rows = np.zeros((leads, at.LEAD_FIELDS))
+    rows, shapes = np.zeros((leads, at.LEAD_FIELDS)), np.zeros((leads, at.SHAPE_POINTS))
+    intervals = np.zeros(at.KEPT_INTERVALS)
     rows[:, [at.SMALLEST_STEP, at.LOWEST, at.LOWEST_OLD, at.LOWEST_OLDER, at.STILLEST]] = np.inf
     return State(
         even, odd, _bell(_COARSE_S, plan.rate_hz), _bell(_FINE_S, plan.rate_hz),
         raw=np.zeros((leads, 2 * plan.length)), power=np.zeros((leads, 2 * plan.length)),
         energy=np.zeros((leads, plan.length)), fused=np.zeros(plan.length),
-        waves=np.zeros((at.KEPT_WAVES, 2)), intervals=np.zeros(at.KEPT_INTERVALS),
-        leads=rows, shapes=np.zeros((leads, at.SHAPE_POINTS)),
-        seen=np.zeros((leads, at.SHAPE_POINTS)),
+        waves=np.zeros((at.KEPT_WAVES, 2)), intervals=intervals,
+        leads=rows, shapes=shapes, seen=np.zeros((leads, at.SHAPE_POINTS)),
         found=np.zeros((64, at.FIELDS)), counters=counters, numbers=numbers,
+        before=at.Learnt(
+            rows.copy(), shapes.copy(), intervals.copy(), counters.copy(), numbers.copy()
+        ),
     )  # fmt: skip
 
 

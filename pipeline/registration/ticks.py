@@ -40,12 +40,14 @@ LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
 NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
 # Places of the state.
 (
-    CYCLE_RR, FADE_PER_S, NOW, STARTED, PHASE, SD, STATE, VALID, FADE, LAST_R, BEATS, RR, SPREAD,
+    CYCLE_RR, FADE_PER_S, NOW, STARTED, PHASE, SD, VALID, FADE, STATE, LAST_R, BEATS, RR, SPREAD,
     GOOD, NEEDED, COUNT, GAP, RINGS,
 ) = range(18)  # fmt: skip
 """Behind it ``KEPT`` intervals, and of each whether it was regular: 1, 0, or -1 for a beat of
 another shape."""
-SIZE = RINGS + 2 * KEPT
+BEFORE = RINGS + 2 * KEPT
+"""And then all that beats have told, from ``STATE`` on, as it was before the last one."""
+SIZE = 2 * BEFORE - STATE
 
 
 @compiled
@@ -101,12 +103,13 @@ def reset(c: Float, cycle_rr_s: float, fade_per_s: float) -> None:
 @compiled
 def _forget(c: Float) -> None:
     """Know of no beat, as at the start; the time and what is rendered stay."""
-    for i in range(RINGS, SIZE):
+    for i in range(RINGS, BEFORE):
         c[i] = 0.0
     c[LAST_R], c[BEATS], c[COUNT] = 0.0, 0.0, 0.0
     c[RR] = c[CYCLE_RR]
     c[SPREAD] = 0.05 * c[CYCLE_RR]
     c[NEEDED] = 3.0
+    c[BEFORE:] = c[STATE:BEFORE]
 
 
 @compiled
@@ -135,6 +138,7 @@ def _was_regular(c: Float, back: int) -> bool:
 def beat(c: Float, r_s: float, strange: bool) -> int:
     """An R peak became known; what kind of beat it is, or -1 if it does not count: it is no later
     than the last, or too far ahead of all that the clock was told."""
+    c[BEFORE:] = c[STATE:BEFORE]
     if not math.isfinite(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
         return -1
     # The last beat counts beside the time: beats may be told in advance, in their order.
@@ -160,6 +164,14 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     if c[STATE] == FIBRILLATING:
         return IRREGULAR_BEAT
     return ECTOPIC_BEAT if early else NORMAL_BEAT
+
+
+@compiled
+def take_back(c: Float) -> None:
+    """The last beat was none: know what was known before it."""
+    # Leads that were lost since are not to be forgotten.
+    if c[GAP] == 0.0:
+        c[STATE:BEFORE] = c[BEFORE:]
 
 
 @compiled

@@ -43,14 +43,9 @@ typedef enum {
     BF_IRREGULAR_BEAT
 } bf_beat_kind;
 
+/* What beats have told. */
 typedef struct {
-    double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
-    double now_s;
-    int started;
-    double phase, sd;
     bf_rhythm rhythm;
-    int valid;
-    double fade;
     double last_r_s;
     double beats;
     double rr_s, spread_s; /* predicted interval, and how far predictions are off */
@@ -59,6 +54,16 @@ typedef struct {
     int gap;               /* beats may have been missed since the last one */
     double interval_s[BF_CLOCK_KEPT];
     int regular[BF_CLOCK_KEPT]; /* 1, 0, or -1 for a beat of another shape */
+} bf_known;
+
+typedef struct {
+    double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
+    double now_s;
+    int started;
+    double phase, sd;
+    int valid;
+    double fade;
+    bf_known known, before; /* now, and before the last beat */
 } bf_clock;
 
 typedef struct {
@@ -77,6 +82,10 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
  * the last, or more than 3 s after the latest time told by bf_now or by a beat: so far ahead it was
  * timed by another clock, or in another unit. */
 bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
+
+/* The last beat was none, as a P wave that its R followed: know what was known before it. To be told
+ * at once, before the beat that shows it; what was rendered since stays, and is corrected. */
+void bf_take_back(bf_clock *clock);
 
 /* Phase now; usable: some lead is connected. Beats told before, but more than 3 s after it, are
  * forgotten, and the rhythm is learnt anew. Returns 0, or -1 when the time is no number or lies
@@ -148,20 +157,21 @@ static double bfc_wrapped(double turns) { return turns - floor(turns + 0.5); }
 /* Know of no beat, as at the start; the time and what is rendered stay. */
 static void bfc_forget(bf_clock *c)
 {
-    memset(c->interval_s, 0, sizeof c->interval_s);
-    memset(c->regular, 0, sizeof c->regular);
-    c->last_r_s = c->beats = 0.0;
-    c->count = 0;
-    c->rr_s = c->cycle_rr_s;
-    c->spread_s = 0.05 * c->cycle_rr_s;
-    c->needed = 3;
+    memset(c->known.interval_s, 0, sizeof c->known.interval_s);
+    memset(c->known.regular, 0, sizeof c->known.regular);
+    c->known.last_r_s = c->known.beats = 0.0;
+    c->known.count = 0;
+    c->known.rr_s = c->cycle_rr_s;
+    c->known.spread_s = 0.05 * c->cycle_rr_s;
+    c->known.needed = 3;
+    c->before = c->known;
 }
 
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
 {
     bf_clock clock;
     memset(&clock, 0, sizeof clock);
-    clock.rhythm = BF_LOST;
+    clock.known.rhythm = BF_LOST;
     clock.cycle_rr_s = cycle_rr_s;
     clock.fade_per_s = fade_per_s;
     bfc_forget(&clock);
@@ -170,28 +180,28 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
 
 static double bfc_tolerance(const bf_clock *c)
 {
-    return bfc_min(bfc_max(BFC_REGULAR * c->rr_s, 3.0 * c->spread_s), BFC_MOST * c->rr_s);
+    return bfc_min(bfc_max(BFC_REGULAR * c->known.rr_s, 3.0 * c->known.spread_s), BFC_MOST * c->known.rr_s);
 }
 
 static int bfc_slot(const bf_clock *c, int back)
 {
-    return (int)((c->count - 1 - back + BF_CLOCK_KEPT) % BF_CLOCK_KEPT);
+    return (int)((c->known.count - 1 - back + BF_CLOCK_KEPT) % BF_CLOCK_KEPT);
 }
 
-static double bfc_interval(const bf_clock *c, int back) { return c->interval_s[bfc_slot(c, back)]; }
+static double bfc_interval(const bf_clock *c, int back) { return c->known.interval_s[bfc_slot(c, back)]; }
 
-static int bfc_was_regular(const bf_clock *c, int back) { return c->regular[bfc_slot(c, back)] > 0; }
+static int bfc_was_regular(const bf_clock *c, int back) { return c->known.regular[bfc_slot(c, back)] > 0; }
 
 /* Whether the last three intervals agree, so that a new rate has come to stay. */
 static int bfc_settled(const bf_clock *c)
 {
     double low, high;
     int back;
-    if (c->count < 3)
+    if (c->known.count < 3)
         return 0;
     low = high = bfc_interval(c, 0);
     for (back = 0; back < 3; back++) {
-        if (c->regular[bfc_slot(c, back)] < 0)
+        if (c->known.regular[bfc_slot(c, back)] < 0)
             return 0;
         low = bfc_min(low, bfc_interval(c, back));
         high = bfc_max(high, bfc_interval(c, back));
@@ -202,8 +212,8 @@ static int bfc_settled(const bf_clock *c)
 /* Whether an interval lies between two beats of the usual shape. */
 static int bfc_own(const bf_clock *c, int count, int back)
 {
-    int before = back + 1 < count && c->regular[bfc_slot(c, back + 1)] < 0;
-    return !before && c->regular[bfc_slot(c, back)] >= 0;
+    int before = back + 1 < count && c->known.regular[bfc_slot(c, back + 1)] < 0;
+    return !before && c->known.regular[bfc_slot(c, back)] >= 0;
 }
 
 /* Size that a third of the steps between intervals `lag` apart stay under. */
@@ -224,7 +234,7 @@ static double bfc_usual_step(const bf_clock *c, int count, int lag)
 
 static double bfc_irregularity(const bf_clock *c)
 {
-    int count = c->count < 10 ? (int)c->count : 10, back;
+    int count = c->known.count < 10 ? (int)c->known.count : 10, back;
     double mean = 0.0;
     if (count < 7)
         return 0.0;
@@ -236,7 +246,7 @@ static double bfc_irregularity(const bf_clock *c)
 /* The next interval: what two before it say, by the latest regular ones (least squares). */
 static void bfc_predict(bf_clock *c)
 {
-    int count = c->count < BF_CLOCK_KEPT ? (int)c->count : BF_CLOCK_KEPT, back;
+    int count = c->known.count < BF_CLOCK_KEPT ? (int)c->known.count : BF_CLOCK_KEPT, back;
     double mean = 0.0, used = 0.0, s11, s12 = 0.0, s22, s1y = 0.0, s2y = 0.0, one, two, step;
     for (back = 0; back < count; back++) {
         if (bfc_was_regular(c, back)) {
@@ -264,7 +274,7 @@ static void bfc_predict(bf_clock *c)
     one = bfc_was_regular(c, 0) ? bfc_interval(c, 0) - mean : 0.0;
     two = count > 1 && bfc_was_regular(c, 1) ? bfc_interval(c, 1) - mean : 0.0;
     step = ((s1y * s22 - s2y * s12) * one + (s2y * s11 - s1y * s12) * two) / (s11 * s22 - s12 * s12);
-    c->rr_s = mean + bfc_min(bfc_max(step, -0.2 * mean), 0.2 * mean);
+    c->known.rr_s = mean + bfc_min(bfc_max(step, -0.2 * mean), 0.2 * mean);
 }
 
 /* What the rhythm is with its latest interval, and when the next beat is due. */
@@ -274,23 +284,23 @@ static void bfc_judge(bf_clock *c, int regular, double off_s)
     double share;
     if (!regular && steady) {
         for (back = 0; back < BF_CLOCK_KEPT; back++)
-            c->regular[bfc_slot(c, back)] = back < 3;
+            c->known.regular[bfc_slot(c, back)] = back < 3;
     }
-    if (regular && c->count > 3)
-        c->spread_s = sqrt(0.8 * c->spread_s * c->spread_s + 0.2 * off_s * off_s);
-    c->good = regular || steady ? c->good + 1 : 0;
+    if (regular && c->known.count > 3)
+        c->known.spread_s = sqrt(0.8 * c->known.spread_s * c->known.spread_s + 0.2 * off_s * off_s);
+    c->known.good = regular || steady ? c->known.good + 1 : 0;
     share = bfc_irregularity(c);
-    if (share > BFC_IRREGULAR || (c->rhythm == BF_FIBRILLATING && share > BFC_ORDERLY)) {
-        c->rhythm = BF_FIBRILLATING;
-        c->needed = 3;
-        c->good = 0;
-    } else if (c->good >= c->needed) {
-        c->rhythm = BF_REGULAR;
-        c->needed = 1;
+    if (share > BFC_IRREGULAR || (c->known.rhythm == BF_FIBRILLATING && share > BFC_ORDERLY)) {
+        c->known.rhythm = BF_FIBRILLATING;
+        c->known.needed = 3;
+        c->known.good = 0;
+    } else if (c->known.good >= c->known.needed) {
+        c->known.rhythm = BF_REGULAR;
+        c->known.needed = 1;
     } else if (!(regular || steady)) {
-        c->rhythm = BF_ECTOPIC;
+        c->known.rhythm = BF_ECTOPIC;
     }
-    if (c->rhythm != BF_REGULAR)
+    if (c->known.rhythm != BF_REGULAR)
         c->valid = 0;
     bfc_predict(c);
 }
@@ -298,41 +308,49 @@ static void bfc_judge(bf_clock *c, int regular, double off_s)
 /* The latest time that the clock was told of, by a question or by a beat. */
 static double bfc_latest(const bf_clock *c)
 {
-    if (c->started && c->beats > 0.0)
-        return bfc_max(c->now_s, c->last_r_s);
-    return c->started ? c->now_s : c->last_r_s;
+    if (c->started && c->known.beats > 0.0)
+        return bfc_max(c->now_s, c->known.last_r_s);
+    return c->started ? c->now_s : c->known.last_r_s;
+}
+
+void bf_take_back(bf_clock *c)
+{
+    /* Leads that were lost since are not to be forgotten. */
+    if (!c->known.gap)
+        c->known = c->before;
 }
 
 bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
 {
     double rr_s, off_s;
     int known, regular, early, place;
-    if (!isfinite(r_s) || (c->beats > 0.0 && !(r_s > c->last_r_s)))
+    c->before = c->known;
+    if (!isfinite(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
         return BF_NO_BEAT;
     /* The last beat counts beside the time: beats may be told in advance, in their order. */
-    if ((c->started || c->beats > 0.0) && r_s > bfc_latest(c) + BFC_AHEAD_S)
+    if ((c->started || c->known.beats > 0.0) && r_s > bfc_latest(c) + BFC_AHEAD_S)
         return BF_NO_BEAT;
-    rr_s = r_s - c->last_r_s;
-    c->last_r_s = r_s;
-    c->beats += 1.0;
-    if (c->beats < 2.0 || c->gap) {
-        c->gap = 0;
+    rr_s = r_s - c->known.last_r_s;
+    c->known.last_r_s = r_s;
+    c->known.beats += 1.0;
+    if (c->known.beats < 2.0 || c->known.gap) {
+        c->known.gap = 0;
         return BF_NORMAL_BEAT;
     }
-    off_s = rr_s - c->rr_s;
-    known = c->count >= 3;
+    off_s = rr_s - c->known.rr_s;
+    known = c->known.count >= 3;
     if (known)
         regular = fabs(off_s) <= bfc_tolerance(c);
     else
-        regular = c->count == 0 || fabs(rr_s - bfc_interval(c, 0)) <= BFC_MOST * rr_s;
+        regular = c->known.count == 0 || fabs(rr_s - bfc_interval(c, 0)) <= BFC_MOST * rr_s;
     regular = regular && !strange;
     early = strange || (known && off_s < -bfc_tolerance(c));
-    place = (int)(c->count % BF_CLOCK_KEPT);
-    c->interval_s[place] = rr_s;
-    c->regular[place] = strange ? -1 : regular;
-    c->count += 1;
+    place = (int)(c->known.count % BF_CLOCK_KEPT);
+    c->known.interval_s[place] = rr_s;
+    c->known.regular[place] = strange ? -1 : regular;
+    c->known.count += 1;
     bfc_judge(c, regular, off_s);
-    if (c->rhythm == BF_FIBRILLATING)
+    if (c->known.rhythm == BF_FIBRILLATING)
         return BF_IRREGULAR_BEAT;
     return early ? BF_ECTOPIC_BEAT : BF_NORMAL_BEAT;
 }
@@ -340,23 +358,23 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
 /* Where the heart should be, if the interval is rr_s and the next beats come as due. */
 static double bfc_place(const bf_clock *c, double now_s, double rr_s)
 {
-    double turns = (now_s - c->last_r_s) / rr_s;
+    double turns = (now_s - c->known.last_r_s) / rr_s;
     return bf_to_cycle(turns - floor(turns), rr_s, c->cycle_rr_s);
 }
 
 /* Notice that no lead shows anything, or that a beat is overdue. */
 static void bfc_watch(bf_clock *c, double now_s, int usable)
 {
-    double waited_s = now_s - c->last_r_s;
-    if (!usable || c->beats < 1.0 || waited_s > 3.0 * c->rr_s) {
-        c->rhythm = BF_LOST;
-        c->needed = 3;
-        c->good = 0;
+    double waited_s = now_s - c->known.last_r_s;
+    if (!usable || c->known.beats < 1.0 || waited_s > 3.0 * c->known.rr_s) {
+        c->known.rhythm = BF_LOST;
+        c->known.needed = 3;
+        c->known.good = 0;
         c->valid = 0;
-        c->gap = 1;
-    } else if (waited_s > c->rr_s + bfc_tolerance(c) + BFC_LATENCY_S) {
-        c->rhythm = c->rhythm == BF_REGULAR ? BF_LOST : c->rhythm;
-        c->good = 0;
+        c->known.gap = 1;
+    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + BFC_LATENCY_S) {
+        c->known.rhythm = c->known.rhythm == BF_REGULAR ? BF_LOST : c->known.rhythm;
+        c->known.good = 0;
         c->valid = 0;
     }
 }
@@ -364,8 +382,8 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
 /* Move the phase towards where the beats say, and judge it. */
 static void bfc_turn(bf_clock *c, double before_s, double now_s)
 {
-    double place = bfc_place(c, now_s, c->rr_s), own = bfc_place(c, before_s, c->rr_s);
-    double turns = floor((now_s - c->last_r_s) / c->rr_s) - floor((before_s - c->last_r_s) / c->rr_s);
+    double place = bfc_place(c, now_s, c->known.rr_s), own = bfc_place(c, before_s, c->known.rr_s);
+    double turns = floor((now_s - c->known.last_r_s) / c->known.rr_s) - floor((before_s - c->known.last_r_s) / c->known.rr_s);
     double natural = place - own + turns, off, h, by_interval, by_peak, near_enough;
     if (c->fade == 0.0 && !c->valid) {
         c->phase = place;
@@ -375,13 +393,13 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
         c->phase -= floor(c->phase);
     }
     off = bfc_wrapped(c->phase - place);
-    h = bfc_max(c->spread_s, 1e-4);
-    by_interval = 0.5 * c->spread_s / h *
-                  bfc_wrapped(bfc_place(c, now_s, c->rr_s - h) - bfc_place(c, now_s, c->rr_s + h));
-    by_peak = BFC_R_SD_S / c->rr_s;
+    h = bfc_max(c->known.spread_s, 1e-4);
+    by_interval = 0.5 * c->known.spread_s / h *
+                  bfc_wrapped(bfc_place(c, now_s, c->known.rr_s - h) - bfc_place(c, now_s, c->known.rr_s + h));
+    by_peak = BFC_R_SD_S / c->known.rr_s;
     c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
     near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
-    c->valid = c->rhythm == BF_REGULAR && c->good >= c->needed && c->sd <= BFC_MOST_SD &&
+    c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed && c->sd <= BFC_MOST_SD &&
                fabs(off) <= near_enough;
 }
 
@@ -395,7 +413,7 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
         c->now_s = now_s;
         /* Told before the first question, so there was nothing to hold it against. Left in, it
          * would make every true beat one that comes too late. */
-        if (c->beats > 0.0 && c->last_r_s > now_s + BFC_AHEAD_S)
+        if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_AHEAD_S)
             bfc_forget(c);
         bfc_watch(c, now_s, usable);
         bfc_turn(c, now_s - passed_s, now_s);
@@ -404,7 +422,7 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
     if (tick) {
         tick->phase = c->phase;
         tick->sd = c->sd;
-        tick->rhythm = c->rhythm;
+        tick->rhythm = c->known.rhythm;
         tick->valid = c->valid;
         tick->fade = c->fade;
     }
