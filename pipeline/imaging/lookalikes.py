@@ -27,7 +27,7 @@ is the root itself that stands on wrong labels, with a stray spot beside it."""
 
 ATRIUM_TOO_OFTEN = 2.5
 """How much more often training shows right atrium than right ventricle where the two meet. Chosen
-by Dice on ten people of the second renderer and four phantoms; 6.7 does as well."""
+by Dice on ten people of the second renderer and four phantoms, of 1, 2.5 and 6.7."""
 
 LEAST_CUT = 0.1
 """A smaller share of the ventricle's widest cut does not make a plane its tip."""
