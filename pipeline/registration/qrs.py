@@ -57,8 +57,8 @@ from pipeline.registration.waves import ALIKE, learn_beat, measure_beat
 
 AHEAD_S, AHEAD, LOW, OWN = 0.25, 2.0, 0.7, 0.98
 """A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
-ventricle beats twice in that time. Unless it looks just like a beat: P waves taken for beats are
-0.90 to 0.98 like them, and a tug at the electrode may follow a small beat."""
+ventricle beats twice in that time. Unless it is just like a beat and came when one was due: a tug
+at the electrode may follow a small beat. P waves come too soon, and are 0.90 to 0.98 like beats."""
 T_WAVE_S, USUAL_S = 0.36, 0.8
 """Until so long after a beat a wave of less than half its energy is that beat's T wave; where the
 usual RR interval is longer than so, later by its root (Bazett, Heart 7:353-370, 1920)."""
@@ -215,7 +215,7 @@ def _height(i: int, plan: Plan, s: State) -> float:
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
     since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
-    low = s.numbers[LAST_HEIGHT] < LOW and s.numbers[LAST_LIKENESS] < OWN
+    low = s.numbers[LAST_HEIGHT] < LOW and not _was_due(at, s)
     ahead = since_s < AHEAD_S and s.counters[BEATS] > 1 and low
     if since_s < REFRACTORY_S and not ahead:
         return
@@ -238,6 +238,14 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     kept = s.counters[WAITING] % KEPT_WAVES
     s.waves[kept, 0], s.waves[kept, 1] = at, height
     s.counters[WAITING] += 1
+
+
+@compiled
+def _was_due(at: int, s: State) -> bool:
+    """Whether the last beat looks like one and ends the interval before it better than a wave."""
+    usual, before = s.before.numbers[USUAL_RR], s.before.counters[LAST_BEAT]
+    off, off_now = abs(s.counters[LAST_BEAT] - before - usual), abs(at - before - usual)
+    return bool(s.numbers[LAST_LIKENESS] >= OWN and off < off_now)
 
 
 @compiled
