@@ -9,7 +9,7 @@ from typing import Any
 import nibabel
 import numpy as np
 import pytest
-from cine_files import write_dicom
+from cine_files import dicom_frame, write_dicom
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Cine
@@ -299,3 +299,25 @@ def test_a_nifti_header_without_sense_is_refused(
     (tmp_path / "cine.nii").write_bytes(content)
     with pytest.raises(InputError, match=rf"cine\.nii: .*{words}"):
         read_nifti_cine(tmp_path / "cine.nii", None, 900.0)
+
+
+@pytest.mark.filterwarnings("ignore:Invalid value for VR IS")
+@pytest.mark.parametrize(
+    ("tag", "value", "words"),
+    [
+        # A private syntax, as GE's, and none at all: which pixels it has nobody can tell.
+        (b"1.2.840.10008.1.2.1\0", b"1.2.840.113619.5.2\0\0", "pixels cannot be read"),
+        (b"\x28\0\x08\0IS\x02\x001 ", b"\x28\0\x08\0IS\x02\0x ", "cannot be understood"),
+    ],
+)
+def test_values_that_no_standard_knows_are_told(
+    tmp_path: Path, tag: bytes, value: bytes, words: str
+) -> None:
+    data = dicom_frame(0, 0)
+    data.NumberOfFrames = 1
+    data.save_as(tmp_path / "odd.dcm")
+    content = (tmp_path / "odd.dcm").read_bytes()
+    assert content.count(tag) == 1
+    (tmp_path / "odd.dcm").write_bytes(content.replace(tag, value))
+    with pytest.raises(InputError, match=rf"odd\.dcm: .*{words}"):
+        read_dicom_study(tmp_path)

@@ -77,7 +77,10 @@ def read_dicom_study(
         dataset = _read(path)
         if _is_directory(dataset):
             continue
-        other = _other_object(dataset)
+        try:
+            other = _other_object(dataset)
+        except (ValueError, TypeError) as error:
+            raise _not_understood(str(path), error) from error
         if other:
             uid = str(dataset.get("SeriesInstanceUID", ""))
             others.append(LeftOut(str(path), _series_name(dataset), uid, other, "object"))
@@ -220,7 +223,8 @@ def _read_by_gdcm(dataset: Any, path: Path) -> Any:
     """
     plain = dataset.get("PhotometricInterpretation") == "MONOCHROME2"
     enhanced = "PerFrameFunctionalGroupsSequence" in dataset
-    if enhanced or not plain or not _syntax(dataset).is_compressed:
+    syntax = _syntax(dataset)
+    if enhanced or not plain or not syntax.is_transfer_syntax or not syntax.is_compressed:
         return None
     import SimpleITK as sitk
 
@@ -272,10 +276,14 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
             patient=str(dataset.get("PatientID", "") or "").strip(),
         )
     except (ValueError, TypeError, IndexError) as error:
-        raise InputError(
-            f"{where}: a value in its header cannot be understood ({error}); "
-            "copy it again from the scanner"
-        ) from error
+        raise _not_understood(where, error) from error
+
+
+def _not_understood(where: str, error: Exception) -> InputError:
+    return InputError(
+        f"{where}: a value in its header cannot be understood ({error}); "
+        "copy it again from the scanner"
+    )
 
 
 def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[float, float]]:

@@ -180,7 +180,8 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
 
 static double bfc_tolerance(const bf_clock *c)
 {
-    return bfc_min(bfc_max(BFC_REGULAR * c->known.rr_s, 3.0 * c->known.spread_s), BFC_MOST * c->known.rr_s);
+    double least_s = bfc_max(BFC_REGULAR * c->known.rr_s, 3.0 * c->known.spread_s);
+    return bfc_min(least_s, BFC_MOST * c->known.rr_s);
 }
 
 static int bfc_slot(const bf_clock *c, int back)
@@ -188,9 +189,15 @@ static int bfc_slot(const bf_clock *c, int back)
     return (int)((c->known.count - 1 - back + BF_CLOCK_KEPT) % BF_CLOCK_KEPT);
 }
 
-static double bfc_interval(const bf_clock *c, int back) { return c->known.interval_s[bfc_slot(c, back)]; }
+static double bfc_interval(const bf_clock *c, int back)
+{
+    return c->known.interval_s[bfc_slot(c, back)];
+}
 
-static int bfc_was_regular(const bf_clock *c, int back) { return c->known.regular[bfc_slot(c, back)] > 0; }
+static int bfc_was_regular(const bf_clock *c, int back)
+{
+    return c->known.regular[bfc_slot(c, back)] > 0;
+}
 
 /* Whether the last three intervals agree, so that a new rate has come to stay. */
 static int bfc_settled(const bf_clock *c)
@@ -382,8 +389,9 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
 /* Move the phase towards where the beats say, and judge it. */
 static void bfc_turn(bf_clock *c, double before_s, double now_s)
 {
-    double place = bfc_place(c, now_s, c->known.rr_s), own = bfc_place(c, before_s, c->known.rr_s);
-    double turns = floor((now_s - c->known.last_r_s) / c->known.rr_s) - floor((before_s - c->known.last_r_s) / c->known.rr_s);
+    double last_r_s = c->known.last_r_s, rr_s = c->known.rr_s;
+    double place = bfc_place(c, now_s, rr_s), own = bfc_place(c, before_s, rr_s);
+    double turns = floor((now_s - last_r_s) / rr_s) - floor((before_s - last_r_s) / rr_s);
     double natural = place - own + turns, off, h, by_interval, by_peak, near_enough;
     if (c->fade == 0.0 && !c->valid) {
         c->phase = place;
@@ -395,12 +403,12 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
     off = bfc_wrapped(c->phase - place);
     h = bfc_max(c->known.spread_s, 1e-4);
     by_interval = 0.5 * c->known.spread_s / h *
-                  bfc_wrapped(bfc_place(c, now_s, c->known.rr_s - h) - bfc_place(c, now_s, c->known.rr_s + h));
-    by_peak = BFC_R_SD_S / c->known.rr_s;
+                  bfc_wrapped(bfc_place(c, now_s, rr_s - h) - bfc_place(c, now_s, rr_s + h));
+    by_peak = BFC_R_SD_S / rr_s;
     c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
     near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
-    c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed && c->sd <= BFC_MOST_SD &&
-               fabs(off) <= near_enough;
+    c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed &&
+               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough;
 }
 
 int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
