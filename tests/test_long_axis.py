@@ -59,6 +59,23 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     assert len(stack.left_out) == 5
 
 
+@pytest.mark.parametrize("digits", [4, 5, 6])
+def test_a_view_is_one_however_its_direction_is_rounded(tmp_path: Path, digits: int) -> None:
+    write_dicom(tmp_path)
+    rng = np.random.default_rng(0)
+    for phase in range(PHASES):
+        data = in_series(dicom_frame(0, phase), 50, "view")
+        jitter = rng.uniform(-0.5, 0.5, 4) * 10.0**-digits
+        # Half-way between two thousandths, and between two tenths of a millimetre.
+        along = [0, 0.5005 + jitter[0], np.sqrt(1 - 0.5005**2) + jitter[1]]
+        data.ImageOrientationPatient = [*along, *np.cross([1, 0, 0], along)]
+        data.ImagePositionPatient = [9.05 + jitter[2], 9.05 + jitter[3], 9]
+        data.NominalInterval = 1000
+        data.save_as(tmp_path / f"view_{phase}.dcm")
+    _, (view,) = read_dicom_study(tmp_path)
+    assert view.cine.intensity.shape[0] == PHASES
+
+
 def test_views_written_then_read_are_the_same(tmp_path: Path) -> None:
     write_dicom(tmp_path / "cine")
     add_view(tmp_path / "cine", 0)

@@ -287,7 +287,8 @@ def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
     beyond = [frame for frame in frames if frame.series_uid in elsewhere]
     if beyond and _is_cine(beyond):
         single -= elsewhere
-    else:
+    elif len(single - elsewhere) <= len(elsewhere):
+        # Late enhancement may have a series for each slice, most of them slices of the cine.
         single -= {name for name in elsewhere if len(slice_positions(by_series[name])) == 1}
     short = by_series.keys() - moving - single - elsewhere
     stills = single | {name for name in short if _within(by_series[name], cine, slices_mm)}

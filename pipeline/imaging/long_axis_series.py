@@ -10,7 +10,13 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine
-from pipeline.imaging.frames import MIN_PHASES, ORIGINAL, PARALLEL_COSINE, Frame
+from pipeline.imaging.frames import (
+    MIN_PHASES,
+    NEAREST_SLICES_MM,
+    ORIGINAL,
+    PARALLEL_COSINE,
+    Frame,
+)
 
 LEAST_ANGLE_DEG = 45.0
 """A long-axis view is turned at least this far from the stack's slices."""
@@ -39,12 +45,16 @@ def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...
     normal = np.cross(stack.mr_from_index[:3, 0], stack.mr_from_index[:3, 1])
     normal /= np.linalg.norm(normal)
     reference = _reference(frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE)
-    slices: dict[tuple[float, ...], list[Frame]] = {}
+    slices: list[list[Frame]] = []
     for frame in sorted(frames, key=lambda one: one.where):
         across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
         if across and frame.kind == ORIGINAL and frame.frame_of_reference in ("", reference):
-            slices.setdefault(_place(frame), []).append(frame)
-    found = (_view(one) for one in slices.values())
+            of_its_slice = next((one for one in slices if _same_slice(one[0], frame)), None)
+            if of_its_slice is None:
+                slices.append([frame])
+            else:
+                of_its_slice.append(frame)
+    found = (_view(one) for one in slices)
     return tuple(view for view in found if view is not None)
 
 
@@ -57,10 +67,14 @@ def _reference(frames: Iterable[Frame]) -> str:
     return max(counted, key=lambda uid: (counted[uid], uid), default="")
 
 
-def _place(frame: Frame) -> tuple[float, ...]:
-    """The same for all images of one slice on one matrix."""
-    place = np.concatenate([frame.position_mm.round(1), frame.axes.ravel().round(3)])
-    return (*frame.pixels.shape, *np.round(frame.spacing_mm, 3), *(place + 0.0))
+def _same_slice(first: Frame, frame: Frame) -> bool:
+    """Whether two images show one slice on one matrix, as nearly as files write places."""
+    return (
+        first.pixels.shape == frame.pixels.shape
+        and np.allclose(frame.spacing_mm, first.spacing_mm, rtol=1e-3)
+        and np.allclose(frame.axes, first.axes, rtol=0, atol=1e-3)
+        and np.allclose(frame.position_mm, first.position_mm, rtol=0, atol=NEAREST_SLICES_MM)
+    )
 
 
 def _view(frames: Sequence[Frame]) -> LongAxis | None:
