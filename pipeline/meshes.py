@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Surface
+from pipeline.geometry import Float, Surface
 
 MESH_ENDINGS = (".vtp", ".stl", ".ply")
+
+# Room for the notes that begin a file.
+_STL_NOTES_BYTES, _NOTES_BYTES = 80, 4096
 
 
 def write_vtp(path: Path, surface: Surface) -> None:
@@ -18,8 +21,10 @@ def write_vtp(path: Path, surface: Surface) -> None:
     import pyvista
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
+    mesh = pyvista.PolyData.from_regular_faces(surface.vertices_mm, surface.triangles)
+    mesh.field_data["SPACE"] = ["LPS"]
     writer = vtkXMLPolyDataWriter()
-    writer.SetInputData(pyvista.PolyData.from_regular_faces(surface.vertices_mm, surface.triangles))
+    writer.SetInputData(mesh)
     writer.SetDataModeToBinary()
     # VTK does not report a failed write, Python does: so VTK only makes the text.
     writer.WriteToOutputStringOn()
@@ -28,7 +33,9 @@ def write_vtp(path: Path, surface: Surface) -> None:
 
 
 def read_mesh(path: Path) -> Surface:
-    """Read a triangle mesh; vertices that STL repeats for every triangle become one.
+    """Read a triangle mesh in LPS; vertices that STL repeats for every triangle become one.
+
+    A file that says it is in RAS, as 3D Slicer notes in what it saves, is turned.
 
     Raises
     ------
@@ -49,7 +56,17 @@ def read_mesh(path: Path) -> Surface:
         raise InputError(f"{path}: cannot be read as a surface ({error})") from error
     if not isinstance(mesh, pyvista.PolyData) or not mesh.n_cells or not len(triangles):
         raise InputError(f"{path}: holds no triangles; a closed surface is needed")
-    return Surface(vertices_mm, triangles)
+    return Surface(_in_lps(vertices_mm, path, mesh), triangles)
+
+
+def _in_lps(vertices_mm: Float, path: Path, mesh: Any) -> Float:
+    """3D Slicer writes ``SPACE=RAS`` into comments of PLY, the head of STL, a field of VTP."""
+    room = _STL_NOTES_BYTES if path.suffix.lower() == ".stl" else _NOTES_BYTES
+    with path.open("rb") as file:
+        noted = b"SPACE=RAS" in file.read(room).partition(b"end_header")[0]
+    if path.suffix.lower() == ".vtp":
+        noted = "SPACE" in mesh.field_data and "RAS" in str(mesh.field_data["SPACE"])
+    return vertices_mm * (-1.0, -1.0, 1.0) if noted else vertices_mm
 
 
 def require_whole(path: Path) -> None:

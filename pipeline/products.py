@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pipeline.geometry import Float, Label, MovingSurface, Surface
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.long_axis_series import LongAxis
-from pipeline.imaging.nifti import read_image, write_image
+from pipeline.imaging.nifti import LPS_FROM_RAS, read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
 
 
@@ -24,8 +24,8 @@ def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> No
     cine = stack.cine
     for number, view in enumerate(views):
         path = folder / f"long_axis_{number}.nii.gz"
-        write_image(path, _compact(view.cine.intensity), view.cine.mr_from_index)
-    write_image(folder / "cine.nii.gz", _compact(cine.intensity), cine.mr_from_index)
+        _write_phases(path, view.cine)
+    _write_phases(folder / "cine.nii.gz", cine)
     write_table(
         folder / "phases.json",
         {
@@ -42,6 +42,11 @@ def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> No
             ],
         },
     )
+
+
+def _write_phases(path: Path, cine: Cine) -> None:
+    step_s = cine.rr_s / len(cine.phases)
+    write_image(path, _compact(cine.intensity), cine.mr_from_index, step_s)
 
 
 def read_cine(folder: Path) -> Cine:
@@ -107,6 +112,26 @@ def _read_moving(folder: Path, name: str, phases: Float) -> MovingSurface:
     ]
     vertices_mm = np.stack([surface.vertices_mm for surface in each])
     return MovingSurface(vertices_mm, each[0].triangles, phases)
+
+
+def write_slicer_transform(path: Path, mr_from_tracker: Float) -> None:
+    """A rigid motion as 3D Slicer and ITK read it (``.tfm``).
+
+    Tracker numbers are taken as they are, and the MR's are RAS, as Slicer shows them: a tool's pose
+    under this transform stands where it belongs beside the MR. An ITK file holds, in LPS, the way
+    from the target to the source.
+    """
+    ras_from_tracker = LPS_FROM_RAS @ mr_from_tracker
+    stored = LPS_FROM_RAS @ np.linalg.inv(ras_from_tracker) @ LPS_FROM_RAS
+    numbers = (*stored[:3, :3].ravel(), *stored[:3, 3])
+    lines = [
+        "#Insight Transform File V1.0",
+        "#Transform 0",
+        "Transform: AffineTransform_double_3_3",
+        f"Parameters: {' '.join(repr(float(number)) for number in numbers)}",
+        "FixedParameters: 0 0 0",
+    ]
+    path.write_text("\n".join(lines) + "\n")
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,6 +57,7 @@ def publishing(target: Path) -> Iterator[Path]:
     with readable_write_errors(target):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
+            _remove_orphans(target)
             remove(partial)
             partial.mkdir()
             yield partial
@@ -77,7 +78,9 @@ def readable_write_errors(target: Path) -> Iterator[None]:
                 "another --out, then run again: finished stages are kept"
             ) from error
         # Some file systems, such as /proc, say so of folders that they will not make.
-        no_folder = error.errno == errno.ENOENT and Path(error.filename or "/") in target.parents
+        refused = Path(error.filename or "/")
+        beside = refused.parent == target.parent and PARTIAL in refused.name
+        no_folder = error.errno == errno.ENOENT and (beside or refused in target.parents)
         if error.errno in REFUSED or no_folder:
             raise InputError(
                 f"{target}: cannot be written ({error.strerror}: {error.filename}); "
@@ -101,6 +104,25 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def _remove_orphans(target: Path) -> None:
+    """Clear away what killed processes left unfinished of one target."""
+    start = f".{target.name}{PARTIAL}"
+    for path in target.parent.iterdir():
+        pid = path.name.removeprefix(start)
+        if path.name.startswith(start) and pid.isdecimal() and not _lives(int(pid)):
+            remove(path)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def remove_partials(folder: Path) -> None:

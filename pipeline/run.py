@@ -244,7 +244,7 @@ def _described(study: Study, stage: Stage) -> dict[str, Any]:
         says["fill_gaps"] = study.cine.fill_gaps
         says["spoilt_slices"] = study.cine.spoilt_slices
     if "us" in stage.inputs and study.us:
-        says["initial_mr_from_tracker"] = study.us.initial_mr_from_tracker
+        says["us"] = study.us.model_dump(exclude={"sweeps"})
     return says
 
 

@@ -22,6 +22,8 @@ from pipeline.yaml_files import read_yaml
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 DICOM_ENDINGS = (".dcm", ".ima", "")
 SWEEP_ENDINGS = (".mha", ".mhd")
+UNREAD_SWEEP_ENDINGS = (".nrrd", ".nhdr", ".mkv", ".webm")
+"""What PLUS and 3D Slicer write as well."""
 
 PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 
@@ -63,6 +65,11 @@ class UltrasoundFiles(_Section):
 
     sweeps: tuple[Path, ...] = Field(min_length=1)
     initial_mr_from_tracker: list[Row] | None = Field(None, min_length=4, max_length=4)
+    probe_from_image: list[Row] | None = Field(None, min_length=4, max_length=4)
+    """Calibration in place of the files' ImageToProbe: from pixels to the probe's marker, mm."""
+
+    pose_frame: str | None = Field(None, pattern="^[A-Za-z][A-Za-z0-9]*$")
+    """Name of the marker or device in whose frame poses are taken, such as Reference."""
 
 
 class Described(_Section):
@@ -290,7 +297,8 @@ def _require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
     """Refuse files that a user took for sweeps, and that nothing would read."""
     taken = found["sweeps"] if found else ()
     for one in files_below(us):
-        if found is None or (one.suffix.lower() in SWEEP_ENDINGS and one not in taken):
+        recorded = one.suffix.lower() in (*SWEEP_ENDINGS, *UNREAD_SWEEP_ENDINGS)
+        if found is None or (recorded and one not in taken):
             raise InputError(
                 f"{us}: {one.relative_to(us)} would not be read; sweeps are .mha or .mhd files "
                 "directly in this folder: convert, move or remove it, name all sweeps under "

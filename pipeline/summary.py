@@ -64,6 +64,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         *_timing(ingest),
         *[("input", text) for text in ingest.get("remarks", [])],
+        *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
         *_orientation(segment),
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
         *_doubtful(segment),

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import os
 import shutil
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -193,6 +195,7 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("keep")
+    shutil.copytree(path, tmp_path / "50%.zarr")
     broken = tmp_path / "broken.zarr"
     shutil.copytree(path, broken)
     (broken / "potential" / "guide" / "c" / "3" / "0" / "0" / "0").write_bytes(b"short")
@@ -203,11 +206,24 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
         (tmp_path / "none.zarr", "nrrd", new, "no such folder"),
         (broken, "nrrd", new, "bytes"),
         (broken, "mhd", new, "bytes"),
+        (path, "mhd", str(path / "inside"), "lies inside the field"),
+        (tmp_path / "50%.zarr", "mhd", new, "take a % in the name"),
     ]:
         assert main(["export", str(field), "--to", form, "--out", out]) == 2
         assert words in capsys.readouterr().err
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["broken.zarr", "taken"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["50%.zarr", "broken.zarr", "taken"]
     assert (taken / "mine.txt").read_text() == "keep"
+
+
+def test_what_a_killed_export_left_is_cleared_away_and_a_living_ones_is_not(path, tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    for pid in (ended.pid, os.getppid()):
+        (tmp_path / f".new.partial-{pid}").mkdir()
+    (tmp_path / ".newer.partial-1").mkdir()
+    export_field(path, "sofa", tmp_path / "new")
+    left = sorted(one.name for one in tmp_path.iterdir())
+    assert left == [f".new.partial-{os.getppid()}", ".newer.partial-1", "new"]
 
 
 def test_a_link_at_the_target_is_not_followed(path, tmp_path):

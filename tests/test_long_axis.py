@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 from cine_files import PHASES, RR_MS, dicom_frame, in_series, write_dicom
 
 from pipeline.errors import InputError
@@ -86,6 +87,9 @@ def test_views_written_then_read_are_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.cine.intensity, views[0].cine.intensity)
     np.testing.assert_allclose(again.cine.mr_from_index, views[0].cine.mr_from_index, atol=1e-6)
     np.testing.assert_array_equal(again.cine.phases, views[0].cine.phases)
+    # Another program sees the mean step from phase to phase.
+    step_s = sitk.ReadImage(str(tmp_path / "cine.nii.gz")).GetSpacing()[3]
+    assert step_s == pytest.approx(stack.cine.rr_s / PHASES, rel=1e-6)
 
 
 def test_views_in_nifti_have_their_own_timing(tmp_path: Path) -> None:

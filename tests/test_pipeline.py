@@ -81,6 +81,7 @@ def test_every_stage_publishes_what_the_design_promises(products: Path) -> None:
         "surface/heart_000.vtp",
         "register/mr_from_tracker.json",
         "register/frames.csv",
+        "register/TrackerToRAS.tfm",
         "bake/field.zarr/manifest.json",
         "bake/field.zarr/zarr.json",
         "evaluate/metrics.json",

@@ -189,9 +189,11 @@ def test_a_sweep_in_a_folder_of_its_own_beside_others_is_not_passed_over(tmp_pat
     (folder / "us" / "notes.txt").touch()
     assert len(open_study(folder).us.sweeps) == 3
     (folder / "us" / "left").mkdir()
-    (folder / "us" / "left" / "sweep_003.mha").touch()
-    with pytest.raises(InputError, match=r"left/sweep_003\.mha would not be read"):
-        open_study(folder)
+    for name in ("left/sweep_003.mha", "sweep.seq.nrrd"):
+        (folder / "us" / name).touch()
+        with pytest.raises(InputError, match=rf"{name} would not be read"):
+            open_study(folder)
+        (folder / "us" / name).unlink()
 
 
 def test_files_that_headers_name_are_input_too(tmp_path: Path) -> None:

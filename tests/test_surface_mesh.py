@@ -154,6 +154,32 @@ def test_a_sound_mesh_is_not_touched_by_untangling():
     )
 
 
+@pytest.mark.parametrize("ending", [".ply", ".stl", ".vtp"])
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("space", ["LPS", "RAS"])
+def test_a_mesh_is_read_in_the_frame_that_its_file_names(
+    tmp_path: Path, ending: str, binary: bool, space: str
+) -> None:
+    """As 3D Slicer notes it: in a comment, in the head, or in a field."""
+    path = tmp_path / f"ball{ending}"
+    ball = pyvista.Sphere(radius=5.0, center=(30, -50, 10))
+    if ending == ".vtp":
+        ball.field_data["SPACE"] = [space]
+    ball.save(path, binary=binary)
+    note = f"3D Slicer output. SPACE={space}".encode()
+    content = path.read_bytes()
+    if ending == ".ply":
+        content = content.replace(b"comment VTK generated PLY File", b"comment " + note)
+    elif ending == ".stl" and binary:
+        content = note.ljust(80, b"\0") + content[80:]
+    elif ending == ".stl":
+        content = b"solid " + note + content[content.index(b"\n") :]
+    path.write_bytes(content)
+    assert (note in content) is (ending != ".vtp")
+    middle = read_mesh(path).vertices_mm.mean(axis=0)
+    np.testing.assert_allclose(middle, (30, -50, 10) if space == "LPS" else (-30, 50, 10), atol=0.1)
+
+
 @pytest.mark.parametrize(("ending", "binary"), [
     (".ply", True), (".ply", False), (".stl", True), (".stl", False), (".vtp", True),
 ])  # fmt: skip

@@ -7,52 +7,10 @@ import zlib
 
 import numpy as np
 import pytest
-import SimpleITK as sitk
-from scipy.spatial.transform import Rotation
+from sweep_files import COLUMNS, FRAMES, PIXELS, ROWS, calibration, good_fields, rigid, text, write
 
 from pipeline.errors import InputError
 from pipeline.imaging.ultrasound import odd_transforms, read_sweep
-
-FRAMES, ROWS, COLUMNS = 5, 12, 17
-PIXELS = np.random.default_rng(0).integers(0, 256, (FRAMES, ROWS, COLUMNS)).astype(np.uint8)
-
-
-def rigid(k):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec([0.1 * k, 0.3, -0.2]).as_matrix()
-    pose[:3, 3] = [100.0 + k, -50.0, 3.0 * k]
-    return pose
-
-
-def calibration(pixel_mm=0.5):
-    matrix = rigid(2)
-    matrix[:3, :3] *= pixel_mm
-    return matrix
-
-
-def text(matrix):
-    return " ".join(f"{value:.17g}" for value in np.asarray(matrix).ravel())
-
-
-def good_fields():
-    fields = {}
-    for k in range(FRAMES):
-        start = f"Seq_Frame{k:04d}_"
-        fields[start + "Timestamp"] = f"{3.0 + 0.05 * k}"
-        fields[start + "ImageStatus"] = "OK"
-        fields[start + "ProbeToTrackerTransform"] = text(rigid(k))
-        fields[start + "ProbeToTrackerTransformStatus"] = "OK"
-        fields[start + "ImageToProbeTransform"] = text(calibration())
-        fields[start + "ImageToProbeTransformStatus"] = "OK"
-    return fields
-
-
-def write(path, fields, pixels=PIXELS, vector=False, compress=False):
-    image = sitk.GetImageFromArray(pixels, isVector=vector)
-    for key, value in fields.items():
-        image.SetMetaData(key, value)
-    sitk.WriteImage(image, str(path), useCompression=compress)
-    return path
 
 
 @pytest.mark.parametrize(
@@ -63,7 +21,8 @@ def test_frames_times_and_poses_are_read(tmp_path, name, compress):
     np.testing.assert_array_equal(sweep.images, PIXELS)
     assert sweep.images.dtype == np.float32
     np.testing.assert_array_equal(sweep.times_s, 3.0 + 0.05 * np.arange(FRAMES))
-    assert (sweep.name, sweep.dropped) == ("s", 0)
+    assert (sweep.name, sweep.pose_frame, sweep.remarks) == ("s", "Tracker", ())
+    np.testing.assert_array_equal(sweep.numbers, np.arange(FRAMES))
     for k in range(FRAMES):
         # Column 3, row 7, through the probe into the tracker, one link after the other.
         probe_mm = calibration() @ [3, 7, 0, 1]
@@ -122,7 +81,8 @@ def test_invalid_frames_are_left_out_and_counted(tmp_path, status):
     fields["Seq_Frame0001_ProbeToTrackerTransform"] = text(np.full((4, 4), np.nan))
     fields["Seq_Frame0001_Timestamp"] = "nan"
     sweep = read_sweep(write(tmp_path / "s.mha", fields))
-    assert sweep.dropped == 1
+    assert sweep.remarks == ("1 of 5 frames left out, which the tracker marked as not valid",)
+    np.testing.assert_array_equal(sweep.numbers, [0, 2, 3, 4])
     np.testing.assert_array_equal(sweep.images, PIXELS[[0, 2, 3, 4]])
     np.testing.assert_allclose(sweep.times_s, 3.0 + 0.05 * np.array([0, 2, 3, 4]))
 
@@ -317,6 +277,9 @@ def test_frames_that_are_not_2d_are_refused(tmp_path, shape):
 
 
 def test_colour_frames_are_refused(tmp_path):
-    colour = np.zeros((FRAMES, ROWS, COLUMNS, 3), np.uint8)
+    colour = np.repeat(PIXELS[..., None], 3, axis=-1)
+    grey = write(tmp_path / "grey.mha", good_fields(), colour, vector=True)
+    np.testing.assert_array_equal(read_sweep(grey).images, PIXELS)
+    colour[0, 0, 0, 2] += 1
     with pytest.raises(InputError, match="3 values a pixel"):
         read_sweep(write(tmp_path / "s.mha", good_fields(), colour, vector=True))

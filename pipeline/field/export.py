@@ -46,6 +46,14 @@ def export_field(path: Path, form: str, out: Path) -> Path:
         raise InputError(f"--to {form}: no such format; there are {', '.join(WRITERS)}")
     if out.exists() or out.is_symlink():
         raise InputError(f"--out {out}: exists already; remove it or choose another place")
+    if out.resolve().is_relative_to(path.resolve()):
+        raise InputError(
+            f"--out {out}: lies inside the field, which it would spoil; choose another"
+        )
+    if form == "mhd" and "%" in str(path.resolve()):
+        raise InputError(
+            f"{path}: MetaImage headers take a % in the name of a file for a number; rename it"
+        )
     require_manifest(path)
     field = _Stored(path.resolve(), read_metadata(path))
     for part in field.arrays:

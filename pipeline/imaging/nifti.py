@@ -53,10 +53,20 @@ def read_image(path: Path) -> tuple[npt.NDArray[Any], Float]:
     return stored.T, LPS_FROM_RAS @ _right_angled_affine(image, path)
 
 
-def write_image(path: Path, array: npt.NDArray[Any], mr_from_index: Float) -> None:
-    """Write ``(z, y, x)`` or ``(phase, z, y, x)`` as gzipped NIfTI; the same bytes every time."""
+def write_image(
+    path: Path, array: npt.NDArray[Any], mr_from_index: Float, step_s: float | None = None
+) -> None:
+    """Write ``(z, y, x)`` or ``(phase, z, y, x)`` as gzipped NIfTI; the same bytes every time.
+
+    Parameters
+    ----------
+    step_s
+        From phase to phase, on average; None where there are none, or it is not known.
+    """
     image = nibabel.Nifti1Image(array.T, LPS_FROM_RAS @ mr_from_index)
     image.header.set_xyzt_units("mm", "sec")
+    if array.ndim == 4:
+        image.header["pixdim"][4] = step_s or 0.0
     path.write_bytes(gzip.compress(image.to_bytes(), compresslevel=1, mtime=0))
 
 

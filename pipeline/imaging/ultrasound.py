@@ -8,17 +8,27 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Float32, require_rigid
+from pipeline.geometry import Float, Float32, Integer
+from pipeline.imaging.sweep_poses import (
+    TRACKER,
+    frame_of_poses,
+    image_calibration,
+    is_tracked,
+    probe_pose,
+    reference_pose,
+    require_resting,
+)
+
+if TYPE_CHECKING:
+    # For types only: a stage's product must not depend on how a study's folder is understood.
+    from pipeline.study import UltrasoundFiles
 
 _FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
-# Pixels of a medical scanner, in mm: outside this the matrix is in other units, or no calibration.
-_PIXEL_MM = (0.01, 4.0)
-
 # A sweep goes over centimetres, and no tracker sees a probe at its own place: what stays within
 # these is in metres.
 _STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
@@ -57,16 +67,60 @@ class Sweep:
     tracker_from_probe: Float
     """``(n, 4, 4)`` what of it the tracker saw: the pose of the marker on the probe."""
 
-    dropped: int = 0
-    """Frames of the file left out because the tracker marked them as not valid."""
+    numbers: Integer
+    """``(n,)`` which frames of the file these are, counted from 0."""
+
+    pose_frame: str = TRACKER
+    """What the tracker's millimetres are counted from: itself, or the patient's reference."""
+
+    tracker_from_reference: tuple[Float, ...] = ()
+    """4x4 each: where the patient's reference was seen, in those frames that tell."""
+
+    remarks: tuple[str, ...] = ()
+    """What a person should know of how the file was read."""
 
 
-def read_sweep(path: Path) -> Sweep:
+def read_sweeps(files: UltrasoundFiles) -> list[Sweep]:
+    """All sweeps of a study.
+
+    Raises
+    ------
+    InputError
+        When one cannot be read (`read_sweep`), when their poses are in different frames, or when
+        the patient's reference moves and nothing says whether poses are to follow it.
+    """
+    given = files.probe_from_image
+    calibration = None if given is None else np.array(given, dtype=float)
+    sweeps = [read_sweep(path, files.pose_frame, calibration) for path in files.sweeps]
+    folder, first = files.sweeps[0].parent, sweeps[0]
+    other = next((one for one in sweeps if one.pose_frame != first.pose_frame), None)
+    if other:
+        raise InputError(
+            f"{folder}: poses of {first.name} are in the frame {first.pose_frame}, those of "
+            f"{other.name} in {other.pose_frame}; name one as us.pose_frame in study.yaml"
+        )
+    if files.pose_frame is None and first.pose_frame == TRACKER:
+        seen = [pose for sweep in sweeps for pose in sweep.tracker_from_reference]
+        probe_mm = np.concatenate([sweep.tracker_from_probe[:, :3, 3] for sweep in sweeps])
+        require_resting(seen, probe_mm.mean(axis=0), str(folder))
+    return sweeps
+
+
+def read_sweep(
+    path: Path, pose_frame: str | None = None, probe_from_image: Float | None = None
+) -> Sweep:
     """Read a ``.mha`` or ``.mhd`` sequence of 2D frames with a pose and a time for each.
 
-    Frames whose image or transforms carry a status other than OK are left out and counted. The
-    pose is ``ProbeToTrackerTransform @ ImageToProbeTransform``; either may stand once for the
-    whole file instead of in each frame.
+    Frames whose image or transforms carry a status other than OK, or a pose of zeros, are left out
+    and told. Transforms may stand once for the whole file instead of in each frame.
+
+    Parameters
+    ----------
+    pose_frame
+        The frame of the poses, such as ``Tracker`` or ``Reference`` (the patient's marker); None:
+        the tracker's where the file has ProbeToTracker, else that of the reference.
+    probe_from_image
+        4x4 from pixels to the probe's marker, mm, in place of the file's ImageToProbe.
 
     Raises
     ------
@@ -77,9 +131,11 @@ def read_sweep(path: Path) -> Sweep:
     """
     path = Path(path)
     images, header = _read_image(path)
-    images = _as_scanned(path, images, header)
+    images, turned = _as_scanned(path, images, header)
     frames = _frame_fields(path, header, len(images))
-    valid = [k for k, fields in enumerate(frames) if _is_valid(fields)]
+    frame = frame_of_poses(frames[0], pose_frame)
+    own = probe_from_image is None
+    valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own)]
     if not valid:
         raise InputError(
             f"{path}: none of its {len(frames)} frames has status OK; the probe was out of the "
@@ -87,16 +143,39 @@ def read_sweep(path: Path) -> Sweep:
         )
     times_s = np.array([_time_s(frames[k], f"{path}, frame {k}") for k in valid])
     _require_rising(path, times_s, valid)
-    links = [_links(frames[k], f"{path}, frame {k}") for k in valid]
-    tracker_from_probe, probe_from_image = (np.stack(link) for link in zip(*links, strict=True))
+    places = [(frames[k], f"{path}, frame {k}") for k in valid]
+    tracker_from_probe = np.stack([probe_pose(one, frame, where) for one, where in places])
+    calibrated = [image_calibration(one, probe_from_image, where) for one, where in places]
+    seen = (reference_pose(one) for one, _ in places)
     return Sweep(
         path.stem,
         np.asarray(images[valid], dtype=np.float32),
         times_s,
-        tracker_from_probe @ probe_from_image,
+        tracker_from_probe @ np.stack(calibrated),
         tracker_from_probe,
-        len(frames) - len(valid),
+        np.array(valid),
+        frame,
+        tuple(pose for pose in seen if pose is not None),
+        (*turned, *_left_out(len(frames) - len(valid), len(frames))),
     )
+
+
+def _left_out(missing: int, frames: int) -> list[str]:
+    if not missing:
+        return []
+    return [f"{missing} of {frames} frames left out, which the tracker marked as not valid"]
+
+
+def remarks_on(sweeps: Sequence[Sweep]) -> list[str]:
+    """What a person should know of the sweeps before a registration is used."""
+    told = [f"{sweep.name}: {text}" for sweep in sweeps for text in sweep.remarks]
+    frame = sweeps[0].pose_frame
+    if frame != TRACKER:
+        told.append(
+            f"poses are those in the frame {frame}: mr_from_tracker starts from there, so give "
+            "the tool's poses in it, too"
+        )
+    return told
 
 
 def odd_transforms(sweeps: Sequence[Sweep]) -> str:
@@ -110,8 +189,9 @@ def odd_transforms(sweeps: Sequence[Sweep]) -> str:
     found = []
     if spread_mm < _STILL_MM and furthest_mm < _TOO_NEAR_MM:
         found.append(
-            f"ProbeToTracker looks as if it were in metres: over all sweeps the probe moves by "
-            f"{spread_mm:.3g} mm, at {furthest_mm:.3g} mm from the tracker or nearer; give mm"
+            f"ProbeTo{sweeps[0].pose_frame} looks as if it were in metres: over all sweeps the "
+            f"probe moves by {spread_mm:.3g} mm, at {furthest_mm:.3g} mm from there or nearer; "
+            "give mm"
         )
     if all(_is_uncalibrated(sweep) for sweep in sweeps):
         found.append(
@@ -140,9 +220,8 @@ def _read_image(path: Path) -> tuple[Any, Fields]:
         raise InputError(
             f"{path}: cannot be read as a MetaImage sequence ({_gist(error)}); {_COPY}"
         ) from error
-    _require_grey_frames(path, image)
     fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
-    return sitk.GetArrayFromImage(image), fields
+    return _grey_frames(path, image, sitk.GetArrayFromImage(image)), fields
 
 
 def _require_all_bytes(path: Path) -> None:
@@ -236,33 +315,42 @@ def _gist(error: RuntimeError) -> str:
     return lines[-1] if lines else "no reason given"
 
 
-def _require_grey_frames(path: Path, image: Any) -> None:
+def _grey_frames(path: Path, image: Any, values: Any) -> Any:
+    """Pixels ``(n, rows, columns)``; frames one pixel thick and colours that are all grey pass."""
     size, components = image.GetSize(), image.GetNumberOfComponentsPerPixel()
-    if len(size) != 3:
+    if len(size) == 4 and size[2] == 1:
+        values = values[:, 0]
+    elif len(size) != 3:
         raise InputError(
             f"{path}: has {len(size)} dimensions {size}; a sweep is a stack of 2D frames "
             "(columns, rows, frames); 3D probes are not supported"
         )
+    if components == 3 and (values == values[..., :1]).all():
+        return values[..., 0]
     if components != 1:
         raise InputError(
             f"{path}: has {components} values a pixel; export grey values, one a pixel"
         )
+    return values
 
 
-def _as_scanned(path: Path, images: Any, header: Fields) -> Any:
-    """Pixels whose columns count up to the transducer's marked side, and rows away from it: MF.
+def _as_scanned(path: Path, images: Any, header: Fields) -> tuple[Any, tuple[str, ...]]:
+    """Pixels whose columns count up to the transducer's marked side, and rows away from it: MF;
+    and what is to be told of it.
 
     ImageToProbe belongs to pictures in this order, to which PLUS turns others when it reads them.
     """
     orientation = header.get("UltrasoundImageOrientation", "MF").upper()
-    if not re.fullmatch("[MU][FN][AD]?|XX", orientation):
+    if not re.fullmatch("[MU][FN][AD]?|XX|", orientation):
         raise InputError(
             f"{path}: UltrasoundImageOrientation is {orientation}; it needs MF, UF, MN or UN "
             "(columns count up to the marked or unmarked side, rows to the far or near end)"
         )
+    if orientation in ("", "XX"):
+        return images, ("UltrasoundImageOrientation is unknown, taken for MF",)
     if orientation[0] == "U":
         images = images[:, :, ::-1]
-    return images[:, ::-1] if orientation[1] == "N" else images
+    return images[:, ::-1] if orientation[1] == "N" else images, ()
 
 
 def _frame_fields(path: Path, header: Fields, slices: int) -> list[Fields]:
@@ -285,12 +373,6 @@ def _span(frames: dict[int, Fields]) -> str:
     return f"numbers {min(frames)} to {max(frames)}" if frames else "no Seq_Frame fields"
 
 
-def _is_valid(fields: Fields) -> bool:
-    """Whether no status that concerns the pose or the picture says otherwise."""
-    names = ("ProbeToTrackerTransformStatus", "ImageToProbeTransformStatus", "ImageStatus")
-    return all(fields.get(name, "OK").upper() == "OK" for name in names)
-
-
 def _time_s(fields: Fields, where: str) -> float:
     text = fields.get("Timestamp", "nothing")
     try:
@@ -310,44 +392,4 @@ def _require_rising(path: Path, times_s: Float, numbers: list[int]) -> None:
             f"{path}: time does not rise from frame {numbers[k]} ({times_s[k]} s) to frame "
             f"{numbers[k + 1]} ({times_s[k + 1]} s); {len(back)} such steps; time stamps must rise "
             "from frame to frame; sort the frames or mend the recorder's clock"
-        )
-
-
-def _links(fields: Fields, where: str) -> tuple[Float, Float]:
-    """Probe to tracker, and pixel to probe, of one frame, each checked."""
-    tracker_from_probe = _matrix(fields, "ProbeToTrackerTransform", where)
-    require_rigid(tracker_from_probe, f"{where}: ProbeToTrackerTransform")
-    probe_from_image = _matrix(fields, "ImageToProbeTransform", where)
-    _require_calibration(probe_from_image, f"{where}: ImageToProbeTransform")
-    return tracker_from_probe, probe_from_image
-
-
-def _matrix(fields: Fields, name: str, where: str) -> Float:
-    """The 4x4 matrix in field ``name``, row by row."""
-    if name not in fields:
-        others = sorted(key for key in fields if key.endswith("Transform"))
-        raise InputError(
-            f"{where}: has no {name}; its transforms are {', '.join(others) or 'none'}; a sweep "
-            "needs ProbeToTracker (the marker's pose) and ImageToProbe (the calibration)"
-        )
-    try:
-        values = np.array([float(word) for word in fields[name].split()])
-    except ValueError:
-        values = np.array([np.nan])
-    if values.shape != (16,) or not np.isfinite(values).all():
-        raise InputError(f"{where}: {name} needs 16 finite numbers, got {fields[name]!r}")
-    return values.reshape(4, 4)
-
-
-def _require_calibration(probe_from_image: Float, where: str) -> None:
-    """Refuse a matrix that does not spread the pixels over a plane in millimetres."""
-    across, down = probe_from_image[:3, 0], probe_from_image[:3, 1]
-    pixel_mm = np.linalg.norm(across), np.linalg.norm(down)
-    flat = np.linalg.norm(np.cross(across, down)) > 0.9 * pixel_mm[0] * pixel_mm[1]
-    sized = _PIXEL_MM[0] <= min(pixel_mm) and max(pixel_mm) <= _PIXEL_MM[1]
-    if not (flat and sized and np.allclose(probe_from_image[3], (0, 0, 0, 1))):
-        raise InputError(
-            f"{where}: is no calibration of pixels in mm: its pixels are {pixel_mm[0]:.3g} by "
-            f"{pixel_mm[1]:.3g} mm; it needs two crossing axes of {_PIXEL_MM[0]} to "
-            f"{_PIXEL_MM[1]} mm a pixel and a last row of 0 0 0 1, got\n{probe_from_image}"
         )

@@ -16,7 +16,7 @@ from pipeline.evaluation.places import settle
 from pipeline.evaluation.tracing import trace_along
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, Float32, MovingSurface, transform_points
-from pipeline.imaging.ultrasound import read_sweep
+from pipeline.imaging.ultrasound import read_sweeps
 from pipeline.paper.moving import animated
 from pipeline.paper.subject import Subject
 from pipeline.products import read_frames, read_surfaces, read_table
@@ -101,12 +101,12 @@ def _scene(subject: Subject, field: ForceField, structure: str) -> Scene:
     study = open_study(subject.study)
     if study.us is None:
         raise InputError(f"{subject.study}: has no us/; give a study with tracked ultrasound")
-    sweep = read_sweep(study.us.sweeps[0])
+    sweep = read_sweeps(study.us)[0]
     rows = [
         row for row in read_frames(subject.products / "register" / "frames.csv")
         if row.sweep == sweep.name and row.valid
     ]  # fmt: skip
-    frames = [row.frame for row in rows]
+    frames = np.searchsorted(sweep.numbers, [row.frame for row in rows])
     assert field.mr_from_tracker is not None
     found = read_table(subject.products / "register" / "mr_from_tracker.json")
     tracker_from_image = put_right(sweep.tracker_from_image, sweep.name, found.get("calibration"))

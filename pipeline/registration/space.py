@@ -43,12 +43,12 @@ _LEAST_OF_USUAL = 0.25
 _STEPS = 5
 # By what share of its usual error a model is further off for each surface of blood that it lacks.
 _LACKING = 0.2
-# Points of the heart at which the expected error is looked at, of each surface.
+# Of each surface, to look at the expected error.
 _POINTS = 200
 _INVERTED = "by its inverse they do: is initial_mr_from_tracker given the other way round?"
 _MISPLACED = (
     "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
-    "ProbeToTracker, ImageToProbe), at the calibration in ImageToProbe, and at units: mm throughout"
+    "ProbeToTracker, ImageToProbe), calibration, units (mm) and axes (LPS; 3D Slicer shows RAS)"
 )
 
 Progress = Callable[[int, int], None]

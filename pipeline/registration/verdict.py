@@ -83,8 +83,8 @@ def _failures(evidence: Evidence, settings: RegisterSettings) -> list[str]:
         reasons.append(
             f"registration ended {evidence.shift_mm:.1f} mm and {evidence.turn_deg:.1f} degrees "
             f"from the start, far outside the {settings.capture_mm:g} mm and "
-            f"{settings.capture_deg:g} degrees that were searched; give a better start or widen "
-            "capture_mm and capture_deg"
+            f"{settings.capture_deg:g} degrees that were searched; give a better start (in "
+            "LPS, where 3D Slicer shows RAS) or widen capture_mm and capture_deg"
         )
     if evidence.valid < settings.min_frames:
         reasons.append(

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import read_ecg
-from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweep
+from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweeps, remarks_on
 from pipeline.job import Job, Skipped
 from pipeline.products import (
     FrameRow,
@@ -17,6 +17,7 @@ from pipeline.products import (
     read_surfaces,
     read_table,
     write_frames,
+    write_slicer_transform,
     write_table,
 )
 from pipeline.registration.clock_offset import Timing
@@ -30,18 +31,18 @@ if TYPE_CHECKING:
 
 
 def run(job: Job) -> dict[str, Any]:
-    """Write ``mr_from_tracker.json`` and ``frames.csv``."""
+    """Write ``mr_from_tracker.json``, ``frames.csv``, and the transform for 3D Slicer."""
     if job.study.us is None:
         raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
     start = _start(job)
-    sweeps = [read_sweep(path) for path in job.study.us.sweeps]
+    sweeps = read_sweeps(job.study.us)
     r_times_s = _r_times_s(job.study)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle.get("rr_s"))
     found = _registered(job, sweeps, timing, surfaces, start)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
-    _write(job, found, _rows(sweeps, phases, found))
+    _write(job, found, _rows(sweeps, phases, found), sweeps[0].pose_frame)
     return {
         "frames": len(found.valid),
         "valid": int(found.valid.sum()),
@@ -56,6 +57,7 @@ def run(job: Job) -> dict[str, Any]:
         "calibration": "; ".join(one.words() for one in found.corrections),
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
         **_clock_figures(found),
+        "remarks": remarks_on(sweeps),
     }
 
 
@@ -69,7 +71,7 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
     """
     if study.us is None:
         return
-    sweeps = [read_sweep(path) for path in study.us.sweeps]
+    sweeps = read_sweeps(study.us)
     timing = _timing(study, sweeps, _r_times_s(study), None)
     if settings.on_failure == "stop":
         require_frames(sweeps, timing.phases(), settings)
@@ -127,9 +129,9 @@ def _r_times_s(study: Study) -> Float:
 
 def _rows(sweeps: list[Sweep], phases: list[Float], found: Registration) -> list[FrameRow]:
     rows = [
-        (sweep.name, number, float(sweep.times_s[number]), float(phases_of[number]))
+        (sweep.name, int(number), float(time_s), float(phase))
         for sweep, phases_of in zip(sweeps, phases, strict=True)
-        for number in range(len(sweep.times_s))
+        for number, time_s, phase in zip(sweep.numbers, sweep.times_s, phases_of, strict=True)
     ]
     return [
         FrameRow(*row, float(residual), bool(valid))
@@ -150,11 +152,12 @@ def _clock_figures(found: Registration) -> dict[str, float | None]:
     }
 
 
-def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
+def _write(job: Job, found: Registration, rows: list[FrameRow], pose_frame: str) -> None:
     write_table(
         job.folder / "mr_from_tracker.json",
         {
             "mr_from_tracker": found.mr_from_tracker.tolist(),
+            "tracker": pose_frame,
             "frame": "LPS",
             "unit": "mm",
             "covariance": found.covariance.tolist(),
@@ -168,4 +171,5 @@ def _write(job: Job, found: Registration, rows: list[FrameRow]) -> None:
             **_clock_figures(found),
         },
     )
+    write_slicer_transform(job.folder / f"{pose_frame}ToRAS.tfm", found.mr_from_tracker)
     write_frames(job.folder / "frames.csv", rows)

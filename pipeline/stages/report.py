@@ -11,7 +11,7 @@ from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.nifti import read_image
 from pipeline.imaging.settings import LOW_CONFIDENCE
-from pipeline.imaging.ultrasound import read_sweep
+from pipeline.imaging.ultrasound import read_sweeps
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
@@ -111,7 +111,8 @@ def _notes(job: Job) -> list[str]:
             "of the slices and the orientation in the file before a field is used with a tracker."
         )
     ingest = job.figures("ingest")
-    notes += [f"Of the input: {text}." for text in ingest["remarks"]]
+    of_ultrasound = job.figures("register")["remarks"] if job.product("register") else []
+    notes += [f"Of the input: {text}." for text in (*ingest["remarks"], *of_ultrasound)]
     missing = ingest["interpolated_slices"]
     if missing:
         named = ", ".join(str(number) for number in missing)
@@ -139,17 +140,18 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     covariance, centre_mm = np.array(found["covariance"]), np.array(found["centre_mm"])
     rows = [row for row in read_frames(folder / "frames.csv") if row.valid]
     chosen = [rows[k] for k in np.linspace(0, len(rows) - 1, ULTRASOUND_FRAMES_SHOWN).astype(int)]
-    sweeps = {path.stem: read_sweep(path) for path in job.study.us.sweeps}
+    sweeps = {sweep.name: sweep for sweep in read_sweeps(job.study.us)}
+    places = [sweeps[row.sweep].numbers.tolist().index(row.frame) for row in chosen]
     # Probes differ, and so may the sizes of their pictures.
-    images = [sweeps[row.sweep].images[row.frame] for row in chosen]
+    images = [sweeps[row.sweep].images[at] for row, at in zip(chosen, places, strict=True)]
     tracker_from_image = {
         name: put_right(sweep.tracker_from_image, name, found["calibration"])
         for name, sweep in sweeps.items()
     }
     image_from_mr = np.stack(
         [
-            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][row.frame])
-            for row in chosen
+            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][at])
+            for row, at in zip(chosen, places, strict=True)
         ]
     )
     figure = pictures.cuts_on_ultrasound(

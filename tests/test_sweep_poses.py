@@ -1,0 +1,157 @@
+"""Which transforms of a recording lead from the probe to the tracker, or to the patient."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from sweep_files import FRAMES, calibration, good_fields, rigid, text, write
+
+from pipeline.errors import InputError
+from pipeline.imaging.ultrasound import read_sweep, read_sweeps, remarks_on
+from pipeline.products import write_slicer_transform
+from pipeline.study import UltrasoundFiles
+
+STEP_MM = 4.0
+PROBE_TO_REFERENCE = "ProbeToReferenceTransform"
+
+
+def reference(k):
+    """The patient's marker: far from the probe, and it drifts and turns a little."""
+    pose = rigid(5)
+    pose[:3, 3] += [STEP_MM * k, 0, 100]
+    return pose
+
+
+def followed(k):
+    return np.linalg.inv(reference(k)) @ rigid(k)
+
+
+def with_reference(**others):
+    fields = good_fields()
+    for k in range(FRAMES):
+        start = f"Seq_Frame{k:04d}_"
+        fields[start + "ReferenceToTrackerTransform"] = text(reference(k))
+        fields[start + "ReferenceToTrackerTransformStatus"] = "OK"
+        for name, value in others.items():
+            fields[start + name] = value(k)
+    return fields
+
+
+def without(fields, name):
+    return {key: value for key, value in fields.items() if not key.endswith(name)}
+
+
+def files(*paths, **keys):
+    return UltrasoundFiles(sweeps=paths, **keys)
+
+
+def poses(sweeps):
+    return sweeps[0].tracker_from_probe
+
+
+def test_poses_follow_the_patients_reference_where_asked(tmp_path):
+    path = write(tmp_path / "s.mha", with_reference())
+    sweeps = read_sweeps(files(path, pose_frame="Reference"))
+    np.testing.assert_allclose(poses(sweeps), [followed(k) for k in range(FRAMES)], atol=1e-9)
+    assert "frame Reference: mr_from_tracker starts from there" in remarks_on(sweeps)[0]
+    still = read_sweeps(files(path, pose_frame="Tracker"))
+    np.testing.assert_allclose(poses(still), [rigid(k) for k in range(FRAMES)])
+    assert remarks_on(still) == []
+
+
+@pytest.mark.parametrize("told_by_probe", [False, True])
+def test_a_reference_that_moves_needs_a_choice(tmp_path, told_by_probe):
+    fields = with_reference()
+    if told_by_probe:
+        fields = without(fields, "ReferenceToTrackerTransform")
+        for k in range(FRAMES):
+            fields[f"Seq_Frame{k:04d}_{PROBE_TO_REFERENCE}"] = text(followed(k))
+    path = write(tmp_path / "s.mha", fields)
+    # Five places 4 mm apart: the root mean square about their middle is the square root of 2 steps.
+    with pytest.raises(InputError, match=r"Reference moves .* by 5\.7 mm .* us\.pose_frame"):
+        read_sweeps(files(path))
+
+
+def test_a_reference_that_moves_between_sweeps_needs_a_choice(tmp_path):
+    for number in range(2):
+        fields = with_reference()
+        for k in range(FRAMES):
+            name = f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"
+            fields[name] = text(reference(3 * number))
+        write(tmp_path / f"{number}.mha", fields)
+    read_sweeps(files(tmp_path / "0.mha"))
+    with pytest.raises(InputError, match=r"Reference moves"):
+        read_sweeps(files(tmp_path / "0.mha", tmp_path / "1.mha"))
+
+
+def test_a_reference_seen_with_a_trackers_noise_rests(tmp_path):
+    rng = np.random.default_rng(0)
+    fields = with_reference()
+    for k in range(FRAMES):
+        shaken = reference(0)
+        shaken[:3, 3] += rng.normal(0, 0.3, 3)
+        fields[f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"] = text(shaken)
+    # What is written while the marker is not seen must not count.
+    fields["Seq_Frame0003_ReferenceToTrackerTransform"] = text(reference(9))
+    fields["Seq_Frame0003_ReferenceToTrackerTransformStatus"] = "INVALID"
+    sweeps = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    np.testing.assert_allclose(poses(sweeps), [rigid(k) for k in range(FRAMES)])
+
+
+def test_frames_whose_reference_was_not_seen_are_left_out_where_it_counts(tmp_path):
+    fields = with_reference() | {"Seq_Frame0002_ReferenceToTrackerTransformStatus": "MISSING"}
+    path = write(tmp_path / "s.mha", fields)
+    (sweep,) = read_sweeps(files(path, pose_frame="Reference"))
+    np.testing.assert_array_equal(sweep.numbers, [0, 1, 3, 4])
+    (sweep,) = read_sweeps(files(path, pose_frame="Tracker"))
+    np.testing.assert_array_equal(sweep.numbers, np.arange(FRAMES))
+
+
+def test_poses_in_the_references_frame_alone_are_taken_and_told(tmp_path):
+    fields = without(
+        with_reference(ProbeToReferenceTransform=lambda k: text(followed(k))), "Status"
+    )
+    fields = without(without(fields, "ProbeToTrackerTransform"), "ReferenceToTrackerTransform")
+    path = write(tmp_path / "s.mha", fields)
+    sweeps = read_sweeps(files(path))
+    np.testing.assert_allclose(poses(sweeps), [followed(k) for k in range(FRAMES)])
+    assert len(remarks_on(sweeps)) == 1
+    other = write(tmp_path / "t.mha", good_fields())
+    with pytest.raises(InputError, match=r"s are in the frame Reference, those of t in Tracker"):
+        read_sweeps(files(path, other))
+    with pytest.raises(InputError, match=r"t\.mha, frame 0: has no ProbeToReferenceTransform"):
+        read_sweeps(files(path, other, pose_frame="Reference"))
+
+
+def test_a_calibration_of_the_study_stands_in_for_the_files(tmp_path):
+    given = calibration(0.25)
+    fields = {key: value for key, value in good_fields().items() if "ImageToProbe" not in key}
+    path = write(tmp_path / "s.mha", fields)
+    with pytest.raises(InputError, match=r"has no ImageToProbe.*us\.probe_from_image"):
+        read_sweep(path)
+    marked = good_fields() | {"Seq_Frame0001_ImageToProbeTransformStatus": "INVALID"}
+    for one in (path, write(tmp_path / "t.mha", marked)):
+        (sweep,) = read_sweeps(files(one, probe_from_image=given.tolist()))
+        wanted = [rigid(k) @ given for k in range(FRAMES)]
+        np.testing.assert_allclose(sweep.tracker_from_image, wanted)
+    with pytest.raises(InputError, match=r"us\.probe_from_image of study\.yaml: is no calibration"):
+        read_sweeps(files(path, probe_from_image=calibration(9.0).tolist()))
+
+
+def test_a_pose_of_zeros_is_none(tmp_path):
+    fields = good_fields() | {"Seq_Frame0004_ProbeToTrackerTransform": text(np.zeros((4, 4)))}
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    np.testing.assert_array_equal(sweep.numbers, np.arange(4))
+    assert remarks_on([sweep]) == [f"s: {sweep.remarks[0]}"]
+
+
+def test_the_transform_for_slicer_puts_tracker_points_beside_the_mr(tmp_path):
+    """Slicer makes the file's inverse, turned from LPS to RAS, the way from child to parent."""
+    mr_from_tracker = rigid(7)
+    write_slicer_transform(tmp_path / "TrackerToRAS.tfm", mr_from_tracker)
+    stored = sitk.ReadTransform(str(tmp_path / "TrackerToRAS.tfm"))
+    turn = np.array([-1.0, -1.0, 1.0])
+    tip = np.array([12.0, -7.0, 30.0])
+    shown = turn * stored.GetInverse().TransformPoint((turn * tip).tolist())
+    np.testing.assert_allclose(shown, turn * (mr_from_tracker @ [*tip, 1])[:3], atol=1e-9)
