@@ -6,11 +6,12 @@
 
 int main(void)
 {
-    double head[2], row[3];
+    double head[3], row[3];
     bf_clock clock;
     if (fread(head, sizeof head, 1, stdin) != 1)
         return 1;
     clock = bf_new_clock(head[0], head[1]);
+    clock.latency_s = head[2];
     while (fread(row, sizeof row, 1, stdin) == 1) {
         double out[6] = {0, 0, 0, 0, 0, 0};
         if (row[0] == 0.0) {

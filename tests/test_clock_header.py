@@ -16,6 +16,8 @@ HERE = Path(__file__).parent
 STRICT = ["-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 SANITIZE = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
+LATENCY_S = 0.16
+
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 
 
@@ -45,8 +47,8 @@ def stream(rng: np.random.Generator) -> np.ndarray:
     beats taken back, and beats of another clock, before the first question too."""
     rows = [(0, 500.0 + rng.uniform(), False)] if rng.random() < 0.5 else []
     r_s, now_s, rr_s = 0.3, 0.0, float(rng.uniform(0.4, 1.2))
-    for _ in range(120):
-        mood = rng.integers(12)
+    for _ in range(300):
+        mood = rng.integers(30)
         rr_s = float(np.clip(rr_s * (1 + 0.03 * rng.normal()), 0.3, 1.6))
         step_s = rr_s * {0: 0.65, 1: 1.4, 2: 3.5, 3: rng.uniform(0.5, 1.5)}.get(int(mood), 1.0)
         lost = mood == 4
@@ -54,7 +56,9 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             rows.append((1, now_s, not (lost and rng.random() < 0.5)))
             now_s += float(rng.uniform(0.001, 0.05))
         if mood == 5:
-            rows.append((1, now_s - 5.0, True))
+            rows.append((1, now_s - rng.choice([5.0, 0.015, 0.025]), True))
+        if mood == 11 and rng.random() < 0.3:
+            rows.append((1, rng.choice([np.nan, now_s + 900.0]), True))
         if mood == 7:
             rows.append((0, r_s + 1000.0, False))
         if mood == 9:
@@ -64,6 +68,8 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             rows.append((2, r_s, False))
         if mood == 8:
             rows.append((0, r_s + rng.uniform(2.5, 3.5), False))
+        if mood == 10:
+            rows.append((0, now_s + rng.choice([0.015, 0.025, 0.4, 1.0]), False))
         r_s += step_s
     return np.array(rows, dtype=float)
 
@@ -71,7 +77,7 @@ def stream(rng: np.random.Generator) -> np.ndarray:
 def by_python(rows: np.ndarray, cycle_rr_s: float) -> np.ndarray:
     from pipeline.registration import ticks
 
-    clock = PhaseClock(cycle_rr_s, f_max_n=2.0, force_rate_n_per_s=8.0)
+    clock = PhaseClock(cycle_rr_s, f_max_n=2.0, force_rate_n_per_s=8.0, latency_s=LATENCY_S)
     c, out = clock._state, np.zeros((len(rows), 6))
     for row, (what, time_s, flag) in zip(out, rows, strict=True):
         if what == 0:
@@ -88,7 +94,7 @@ def by_python(rows: np.ndarray, cycle_rr_s: float) -> np.ndarray:
 def test_c_says_what_python_says(program, seed):
     rng = np.random.default_rng(seed)
     rows, cycle_rr_s = stream(rng), float(rng.uniform(0.5, 1.2))
-    given = np.array([cycle_rr_s, 4.0]).tobytes() + rows.tobytes()
+    given = np.array([cycle_rr_s, 4.0, LATENCY_S]).tobytes() + rows.tobytes()
     done = subprocess.run([program], input=given, capture_output=True, check=True)
     found = np.frombuffer(done.stdout).reshape(-1, 6)
     expected = by_python(rows, cycle_rr_s)
@@ -96,11 +102,60 @@ def test_c_says_what_python_says(program, seed):
     # may differ by units in the last place, which nothing here amplifies a millionfold.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
     assert {0, 1, 2} <= set(expected[:, 3]), "the stream meets most states"
-    other_clock = expected[rows[:, 1] > 1000, 0]
+    other_clock = expected[(rows[:, 0] == 0) & (rows[:, 1] > 1000), 0]
     assert len(other_clock)
     assert (other_clock == -1).all()
     assert len(STATES) == 4
     assert len(KINDS) == 3
+
+
+NEVER_VALID = r"""
+#include <stdio.h>
+#include <math.h>
+#define BEATFIELD_CLOCK_IMPLEMENTATION
+#include "beatfield_clock.h"
+int main(void)
+{
+    const double wrong[][2] = {{0.0, 5.0}, {800.0, 5.0}, {NAN, 5.0}, {0.8, -5.0}, {0.8, 0.0},
+                               {0.8, INFINITY}, {0.8, NAN}, {0.8, 5.0}};
+    int n, k;
+    for (n = 0; n < 8; n++) {
+        bf_clock clock = bf_new_clock(wrong[n][0], wrong[n][1]);
+        bf_tick tick;
+        double most = 0, least = 0;
+        int valid = 0, sound = 1;
+        for (k = 0; k < 20000; k++) {
+            if (k % 800 == 130) bf_beat(&clock, 0.001 * (k - 130), 0);
+            bf_now(&clock, 0.001 * k, 1, &tick);
+            valid += tick.valid;
+            sound &= isfinite(tick.phase) && isfinite(tick.sd);
+            most = fmax(most, tick.fade);
+            least = fmin(least, tick.fade);
+        }
+        printf("%d %d %g %g\n", valid > 0, sound, least, most);
+    }
+    return 0;
+}
+"""
+
+
+def test_a_clock_of_nonsense_is_never_valid_and_renders_nothing(tmp_path):
+    (tmp_path / "wrong.c").write_text(NEVER_VALID)
+    command = ["gcc", "-std=c99", *STRICT, *SANITIZE, f"-I{get_include()}"]
+    program = tmp_path / "wrong"
+    subprocess.run([*command, tmp_path / "wrong.c", "-o", program, "-lm"], check=True)
+    said = subprocess.run([program], capture_output=True, check=True, text=True).stdout.split("\n")
+    assert said[:7] == ["0 1 0 0"] * 7
+    assert said[7] == "1 1 0 1"
+
+
+def test_a_compiler_that_takes_no_numbers_for_numbers_is_refused(tmp_path):
+    command = ["gcc", "-ffast-math", f"-I{get_include()}", "-c", str(HERE / "clock_driver.c")]
+    done = subprocess.run(
+        [*command, "-o", tmp_path / "out.o"], capture_output=True, check=False, text=True
+    )
+    assert done.returncode != 0
+    assert "compile without -ffast-math" in done.stderr
 
 
 def test_phases_map_alike(tmp_path):

@@ -28,7 +28,7 @@ static double number(const char *word)
 {
     char *end;
     double value = strtod(word, &end);
-    return end > word && !*end ? value : NAN;
+    return end > word && !*end ? value : (double)NAN;
 }
 
 /* The table of peaks, row by row. */

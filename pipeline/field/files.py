@@ -52,16 +52,17 @@ def _size(path: Path) -> int:
         raise InputError(f"{path}: cannot be read ({error.strerror}); bake it again") from error
 
 
-def require_manifest(path: Path) -> None:
+def require_manifest(path: Path) -> bytes:
     """Raise InputError unless the folder has the manifest that is written last, and it agrees.
 
-    Only the attributes are compared with it; this is the check that costs nothing.
+    Only the attributes are compared with it; this is the check that costs nothing. Returns the
+    manifest's text.
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
     try:
-        manifest = json.loads((path / MANIFEST).read_bytes())
-        expected = manifest["files"][ATTRIBUTES]["sha256"]
+        text = (path / MANIFEST).read_bytes()
+        expected = json.loads(text)["files"][ATTRIBUTES]["sha256"]
         actual = hashlib.sha256((path / ATTRIBUTES).read_bytes()).hexdigest()
     except FileNotFoundError as error:
         missing = Path(error.filename).name
@@ -73,6 +74,7 @@ def require_manifest(path: Path) -> None:
         raise InputError(f"{path / MANIFEST}: cannot be read ({error!r}); bake again") from error
     if expected != actual:
         raise InputError(f"{path / ATTRIBUTES}: is not what the manifest says; bake it again")
+    return text
 
 
 def read_metadata(path: Path) -> FieldMetadata:

@@ -148,7 +148,8 @@ def moment_of(line, phase):  # type: ignore[no-untyped-def]
     first, count = line[0, 0], len(line)
     turned = phase
     if not first <= turned < first + 1.0:
-        turned -= math.floor(phase - first)
+        # Of a float, for no integer holds what a phase may be.
+        turned -= np.floor(phase - first)
         if turned >= first + 1.0:
             turned -= 1.0
     # Phases are mostly evenly spaced; where they are not, halving finds the interval.

@@ -6,10 +6,12 @@ import itertools
 import re
 from typing import Any, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import DEVICES, Device, Fixture, Kind, Side
+from pipeline.geometry import require_rigid
 
 FORMAT_VERSION = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -148,6 +150,12 @@ class FieldMetadata(Part):
     @model_validator(mode="after")
     def _phases_rise(self) -> Self:
         require_phases(self.phases, "phases")
+        return self
+
+    @model_validator(mode="after")
+    def _transform_is_rigid(self) -> Self:
+        if self.mr_from_tracker is not None:
+            require_rigid(np.array(self.mr_from_tracker), "mr_from_tracker")
         return self
 
     @model_validator(mode="after")

@@ -8,6 +8,7 @@ millijoules.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from pipeline.errors import InputError
@@ -21,7 +22,8 @@ class EnergyTank:
     Energy that the hand gives fills the tank, up to its capacity; energy that the hand gets drains
     it; where it is empty, the part of the force that would drive the motion on is withheld. So
     the hand never gets more than the tank held at first, but for one tick's step that could not be
-    foreseen. ``bf_pass`` of the C header is the same.
+    foreseen. It counts what it passes, so that must be what the hand gets: fading and a device's
+    limit come before it. A torque is not counted. ``bf_pass`` of the C header is the same.
 
     Raises
     ------
@@ -38,10 +40,17 @@ class EnergyTank:
         self.level_mj = level_mj
         self._capacity_mj = capacity_mj
         self._point_mm: Sequence[float] | None = None
-        self._force_n: Sequence[float] = (0.0, 0.0, 0.0)
+        self._force_n: Triple = (0.0, 0.0, 0.0)
 
     def passed(self, point_mm: Sequence[float], force_n: Sequence[float]) -> Triple:
-        """The force to render at the tool's present point, of the one that the field wants."""
+        """The force to render at the tool's present point, of the one that is wanted.
+
+        Where one of them is not finite nothing is rendered.
+        """
+        if not math.isfinite(sum(point_mm) + sum(force_n)):
+            # No force holds from here on, so none of its work is counted wherever the tool goes.
+            self._force_n = (0.0, 0.0, 0.0)
+            return self._force_n
         last = self._point_mm if self._point_mm is not None else point_mm
         way = [now - before for now, before in zip(point_mm, last, strict=True)]
         way2 = _dot(way, way)

@@ -114,12 +114,15 @@ class ForceField:
         Raises
         ------
         InputError
-            When the folder is no complete field, or its description or size is wrong. Values are
-            not read; ``beatfield verify`` checks every byte.
+            When it is no complete field, its description or size is wrong, or it was replaced
+            meanwhile. Values are not read; ``beatfield verify`` checks every byte.
         """
-        path = Path(path)
-        require_manifest(path)
-        return cls(path, read_metadata(path))
+        path = Path(path).resolve()
+        manifest = require_manifest(path)
+        field = cls(path, read_metadata(path))
+        if require_manifest(path) != manifest:
+            raise InputError(f"{path}: was replaced while it was opened; open it again")
+        return field
 
     @property
     def phases(self) -> Float:
@@ -310,8 +313,8 @@ class ForceField:
         Raises
         ------
         InputError
-            When the pose is not rigid, a number not finite, the fixture unknown, or the field
-            damaged.
+            When the pose is not rigid, a number not finite, the fixture unknown, the tool longer
+            than 20 diagonals of the grid, or the field damaged.
         """
         kernel = self._tool_force or self._load_tools()
         if not (bound_n > 0 and math.isfinite(phase)):
@@ -333,6 +336,8 @@ class ForceField:
                 law, lines.points_mm, lines.starts, tool.handle_mm, pose,
                 float(phase), float(bound_n), found,
             )  # fmt: skip
+        if asked == -2:
+            raise InputError("tool is longer than 20 diagonals of the grid; its unit is mm")
         if asked < 0:
             require_rigid(pose, "mr_from_tool")
             raise InputError(f"mr_from_tool: is no rotation and shift to 1e-3, got\n{pose}")

@@ -19,6 +19,8 @@ ASKED, INNER = kernels.ASKED, kernels.INNER
 
 HALVINGS = 12
 """A stretch of a tool is halved no more often than this."""
+LONGEST = 20.0
+"""Times the grid's diagonal: a tool's line that is longer is in another unit."""
 
 
 @njit(**INNER)
@@ -96,12 +98,17 @@ def _is_rigid(pose):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # type: ignore[no-untyped-def]
-    """``tool_force`` on one line; its length, and how often the field was asked."""
+    """``tool_force`` on one line; its length, and how often the field was asked, -1: too long."""
     grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
     stack, places, walk = room[:, :7], room[:, 7:11], room[-1]
     left, right = room[-2], room[-3]
     walk[0], walk[1], walk[2] = 0.0, 0.0, 0.0
     total = _length(line_mm)
+    diagonal2 = 0.0
+    for axis in range(3):
+        diagonal2 += ((grid[6 + axis] - 1.0) * grid[3 + axis]) ** 2
+    if total > LONGEST * math.sqrt(diagonal2):
+        return total, -1
     if len(line_mm) > 1:
         walk[2] = _piece_length(line_mm, 0)
     longest = 2.0 * min(grid[3], grid[4], grid[5])
@@ -195,7 +202,8 @@ def tool_force(law, points_mm, starts, handle_mm, pose, phase, bound_n, found): 
 
     Returns
     -------
-    How often the field was asked; -1, and nothing found, where the pose is not rigid.
+    How often the field was asked; -1, and nothing found, where the pose is not rigid, and -2 where
+    a line is longer than `LONGEST` diagonals of the grid.
     """
     if not _is_rigid(pose):
         return -1
@@ -207,6 +215,8 @@ def tool_force(law, points_mm, starts, handle_mm, pose, phase, bound_n, found): 
         part[:] = 0.0
         line_mm = points_mm[starts[n] : starts[n + 1]]
         length, questions = _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, part)
+        if questions < 0:
+            return -2
         asked += questions
         length = length if length > 0.0 else 1.0
         weight += length

@@ -33,7 +33,9 @@ Kind = Literal["normal", "ectopic", "irregular"]
 
 STATES: tuple[State, ...] = ("lost", "regular", "ectopic", "fibrillating")
 KINDS: tuple[Kind, ...] = ("normal", "ectopic", "irregular")
-SHORTEST_RR_S, LONGEST_RR_S = 0.2, 3.0
+
+# A phase known later than that is of another beat.
+_LONGEST_LATENCY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,8 @@ class PhaseClock:
         Length of the nominal beat whose phases are asked for: ``rr_s`` of the baked field.
     f_max_n, force_rate_n_per_s
         Largest force of the fixture, and how fast it may be faded in or out.
+    latency_s
+        How long after its R peak a beat may be told: an overdue one is noticed so much later.
 
     Raises
     ------
@@ -75,12 +79,21 @@ class PhaseClock:
     """
 
     def __init__(
-        self, cycle_rr_s: float, *, f_max_n: float = 3.3, force_rate_n_per_s: float = 10.0
+        self,
+        cycle_rr_s: float,
+        *,
+        f_max_n: float = 3.3,
+        force_rate_n_per_s: float = 10.0,
+        latency_s: float = ticks.LATENCY_S,
     ) -> None:
-        if not SHORTEST_RR_S <= cycle_rr_s <= LONGEST_RR_S:
+        if not ticks.SHORTEST_RR_S <= cycle_rr_s <= ticks.LONGEST_RR_S:
             raise InputError(
                 f"clock: cycle_rr_s = {cycle_rr_s:g} is no heartbeat; give "
-                f"{SHORTEST_RR_S:g} to {LONGEST_RR_S:g} seconds"
+                f"{ticks.SHORTEST_RR_S:g} to {ticks.LONGEST_RR_S:g} seconds"
+            )
+        if not 0 < latency_s <= _LONGEST_LATENCY_S:
+            raise InputError(
+                f"clock: latency_s = {latency_s:g}; give up to {_LONGEST_LATENCY_S:g} seconds"
             )
         if not (0 < f_max_n < math.inf and 0 < force_rate_n_per_s < math.inf):
             raise InputError(
@@ -88,7 +101,7 @@ class PhaseClock:
                 "both must be positive"
             )
         self._state = np.empty(ticks.SIZE)
-        ticks.reset(self._state, cycle_rr_s, force_rate_n_per_s / f_max_n)
+        ticks.reset(self._state, cycle_rr_s, force_rate_n_per_s / f_max_n, latency_s)
 
     def beat(self, r_time_s: float, strange: bool = False) -> Kind | None:
         """Tell the clock of an R peak; what kind of beat it is.
@@ -118,8 +131,9 @@ class PhaseClock:
     def at(self, now_s: float, usable: bool = True) -> Tick:
         """Phase now.
 
-        Beats that lie more than 3 s after it were told too early to be judged: they are forgotten,
-        and the rhythm is learnt anew.
+        Where the last beat lies more than 0.02 s ahead of it, beats and questions are timed by
+        different clocks: all beats are forgotten, and the rhythm is learnt anew. The fade moves by
+        0.02 s' worth at most, however long nobody asked.
 
         Parameters
         ----------
@@ -131,11 +145,13 @@ class PhaseClock:
         Raises
         ------
         InputError
-            When the time is before the last one, or not a number.
+            When the time is before the last one, or not a number. If it is so by more than 0.02 s,
+            beats are forgotten, the fade falls as in a millisecond, and time goes on from there.
         """
         c = self._state
+        before_s = c[ticks.NOW]
         if ticks.advance(c, float(now_s), bool(usable)) < 0:
-            raise InputError(f"clock: asked for {now_s} s after {c[ticks.NOW]} s; time must rise")
+            raise InputError(f"clock: asked for {now_s} s after {before_s} s; time must rise")
         return Tick(
             float(c[ticks.PHASE]),
             float(c[ticks.SD]),

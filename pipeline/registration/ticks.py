@@ -18,6 +18,8 @@ SLOWEST_BPM, FASTEST_BPM = 45.0, 120.0
 KICK_S = 0.12
 LATENCY_S = 0.14
 """An R peak is known about 0.132 s after it, 99 in 100 within this."""
+SHORTEST_RR_S, LONGEST_RR_S = 0.2, 3.0
+"""Of a heart."""
 R_SD_S = 0.002
 KEPT = 16
 REGULAR_SHARE, MOST_SHARE = 0.10, 0.17
@@ -35,14 +37,19 @@ has no order; and below which it has one again."""
 AHEAD_S = 3.0
 """How far a beat may lie beyond the latest time that the clock was told of: no heart waits longer,
 so what lies further ahead was timed by another clock, or in another unit."""
+SLACK_S = 0.02
+"""How far a beat may lie ahead of the time asked for (no heart has beaten before it beats), and a
+time before the one before it; and how much time one step of the fade may make up for."""
+TICK_S = 0.001
+"""What is taken to have passed where the time tells nothing: a turn of a haptic loop."""
 
 LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
 NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
 # Places of the state.
 (
-    CYCLE_RR, FADE_PER_S, NOW, STARTED, PHASE, SD, VALID, FADE, STATE, LAST_R, BEATS, RR, SPREAD,
-    GOOD, NEEDED, COUNT, GAP, RINGS,
-) = range(18)  # fmt: skip
+    CYCLE_RR, FADE_PER_S, LATENCY, NOW, STARTED, PHASE, SD, VALID, FADE, STATE, LAST_R, BEATS, RR,
+    SPREAD, GOOD, NEEDED, COUNT, GAP, RINGS,
+) = range(19)  # fmt: skip
 """Behind it ``KEPT`` intervals, and of each whether it was regular: 1, 0, or -1 for a beat of
 another shape."""
 BEFORE = RINGS + 2 * KEPT
@@ -91,12 +98,13 @@ def wrapped(turns: float) -> float:
 
 
 @compiled
-def reset(c: Float, cycle_rr_s: float, fade_per_s: float) -> None:
-    """A clock that has seen nothing."""
+def reset(c: Float, cycle_rr_s: float, fade_per_s: float, latency_s: float) -> None:
+    """A clock that has seen nothing; all three are sound."""
     for i in range(SIZE):
         c[i] = 0.0
     c[CYCLE_RR] = cycle_rr_s
     c[FADE_PER_S] = fade_per_s
+    c[LATENCY] = latency_s
     _forget(c)
 
 
@@ -303,19 +311,32 @@ def advance(c: Float, now_s: float, usable: bool) -> int:
     Afterwards ``c`` holds phase, its standard deviation, state, validity and fade.
     """
     if not math.isfinite(now_s) or (c[STARTED] > 0.0 and now_s < c[NOW]):
+        _lose_time(c, now_s)
         return -1
     passed_s = now_s - c[NOW] if c[STARTED] > 0.0 else 0.0
     before_s = now_s - passed_s
     c[STARTED], c[NOW] = 1.0, now_s
-    if c[BEATS] > 0.0 and c[LAST_R] > now_s + AHEAD_S:
-        # Told before the first question, so there was nothing to hold it against. Left in, it
-        # would make every true beat one that comes too late.
+    if c[BEATS] > 0.0 and c[LAST_R] > now_s + SLACK_S:
+        # Left in, it would shift the phase, and make true beats come too late.
         _forget(c)
+        c[VALID] = 0.0
     _watch(c, now_s, usable)
     _turn(c, before_s, now_s)
-    reach = c[FADE_PER_S] * passed_s
+    reach = c[FADE_PER_S] * min(passed_s, SLACK_S)
     c[FADE] += min(max(c[VALID] - c[FADE], -reach), reach)
     return 0
+
+
+@compiled
+def _lose_time(c: Float, now_s: float) -> None:
+    """A time that is none, or of another clock: what beats told of is worth nothing any more."""
+    if now_s >= c[NOW] - SLACK_S:
+        return
+    _forget(c)
+    c[STATE], c[GOOD], c[VALID] = LOST, 0.0, 0.0
+    c[FADE] = max(c[FADE] - c[FADE_PER_S] * TICK_S, 0.0)
+    if math.isfinite(now_s):
+        c[NOW] = now_s
 
 
 @compiled
@@ -326,7 +347,7 @@ def _watch(c: Float, now_s: float, usable: bool) -> None:
         c[STATE], c[NEEDED], c[GOOD], c[VALID] = LOST, 3.0, 0.0, 0.0
         # How many beats were missed is unknown: the next one ends no interval.
         c[GAP] = 1.0
-    elif waited_s > c[RR] + tolerance(c) + LATENCY_S:
+    elif waited_s > c[RR] + tolerance(c) + c[LATENCY]:
         # After an early beat comes a pause, and in fibrillation nothing is due.
         c[STATE] = LOST if c[STATE] == REGULAR else c[STATE]
         c[GOOD], c[VALID] = 0.0, 0.0

@@ -20,7 +20,12 @@
  * heartbeat since the R peak (any number; its fraction counts), transforms are row-major 4x4 on
  * column points. Distances are negative inside. A query allocates nothing and calls no system
  * function, so it is safe in a real-time loop and from several threads at once. Where it fails, its
- * answers are zeros.
+ * answers are zeros. Forces and torques are in the frame of the MR, as points are: a device in the
+ * tracker's frame gets them by bf_turn_back(field.mr_from_tracker, force_n, ...).
+ *
+ * Not for -ffast-math, which takes what is no number for one, nor for a big-endian processor. An open
+ * field must not be copied, opened again or closed while a thread asks it. Replace a store whole, by
+ * renaming: until bf_lock has copied it, a file that shrinks ends the program (SIGBUS).
  *
  * The distance between nodes and phases is the quadratic B-spline whose coefficients the store
  * holds under spline/: neither its gradient nor its rate has a step anywhere. Potential and force
@@ -31,7 +36,9 @@
 #ifndef BEATFIELD_H
 #define BEATFIELD_H
 
-#if defined(BEATFIELD_IMPLEMENTATION) && !defined(_WIN32) && !defined(_POSIX_C_SOURCE)
+/* Only where nothing but standard C is declared otherwise: it would take other declarations away. */
+#if defined(BEATFIELD_IMPLEMENTATION) && defined(__STRICT_ANSI__) && !defined(_WIN32) && \
+    !defined(_POSIX_C_SOURCE) && !defined(__cplusplus)
 #define _POSIX_C_SOURCE 200809L
 #endif
 
@@ -48,14 +55,15 @@ typedef enum {
     BF_OK = 0,
     BF_CANNOT_READ,  /* a file is missing, or may not be read */
     BF_NOT_A_FIELD,  /* no manifest, or a description that is not that of a field */
-    BF_WRONG_SIZE,   /* a file's size is not what the description says */
+    BF_WRONG_SIZE,   /* a file's size is not what the description says; or a batch's or tool's is none */
     BF_DAMAGED,      /* a file is not what the manifest says, or a value in it is not finite */
     BF_NO_MEMORY,    /* malloc or mmap refused */
     BF_CANNOT_LOCK,  /* mlock refused (ulimit -l); pages are in memory, but may be paged out */
     BF_NO_SUCH_NAME, /* number of a structure or fixture that is not there */
-    BF_NOT_FINITE,   /* a coordinate or phase is infinite or not a number */
+    BF_NOT_FINITE,   /* a coordinate or phase is not a number, infinite, or too large to add up */
     BF_NOT_RIGID,    /* mr_from_tool is no rotation and shift */
-    BF_WRONG_BOUND   /* bound_n is not above 0 */
+    BF_WRONG_BOUND,  /* bound_n is not above 0 */
+    BF_REPLACED      /* the store was replaced while it was opened: open it again */
 } bf_status;
 
 typedef struct {
@@ -70,6 +78,7 @@ typedef struct {
     int m;           /* sharpness */
     double delta_mm; /* width */
     double f_max_n;  /* largest force */
+    double device_force_n; /* what its device renders at most, whatever fixtures add up to; 0: unknown */
 } bf_fixture_part;
 
 typedef struct {
@@ -81,27 +90,31 @@ typedef struct {
     double *line;        /* four numbers a phase: where which weights hold */
     double rr_s;         /* heartbeat when the images were taken; 0 where unknown */
     int registered;      /* whether mr_from_tracker is known */
-    double mr_from_tracker[16];
+    double mr_from_tracker[16]; /* where it is not known: not numbers, so that no question succeeds */
     int structures, fixtures;
     bf_structure_part *structure;
     bf_fixture_part *fixture;
     size_t bytes; /* of one phase of one array */
     int wide;     /* whether the processor reads four nodes at a time */
+    int copied;   /* whether values are a copy of the files */
 } bf_field;
 
 /* What a status means, in a few words. */
 const char *bf_text(bf_status status);
 
-/* Map a field.zarr into memory. On failure the field is as bf_close leaves it. */
+/* Map a field.zarr into memory; of what the field was before, nothing is given back. On failure the
+ * field is as bf_close leaves it. */
 bf_status bf_open(bf_field *field, const char *path);
 
 /* Compare every file of a field.zarr with its manifest (reads all of it; not for the loop). */
 bf_status bf_verify(const char *path);
 
-/* Bring all pages into memory and keep them there. */
+/* Copy all values from the files into memory and keep them there: whatever becomes of the files after
+ * that changes nothing. Where it fails with BF_CANNOT_LOCK they are copied all the same. Before the
+ * first question: it must not run while a thread asks. */
 bf_status bf_lock(bf_field *field);
 
-/* Give everything back; harmless twice. */
+/* Give everything back; harmless twice. No thread may be asking any more. */
 void bf_close(bf_field *field);
 
 /* Number of a structure or fixture by name; -1 where there is none. */
@@ -112,23 +125,23 @@ int bf_fixture(const bf_field *field, const char *name);
  * boundary, and says less the farther out it is. */
 int bf_contains(const bf_field *field, const double point_mm[3]);
 
-/* Signed distance in mm and its gradient; either may be NULL. */
+/* Signed distance in mm and its gradient in the frame of the MR; either may be NULL. */
 bf_status bf_distance(const bf_field *field, int structure, const double point_mm[3], double phase,
                       double *distance_mm, double gradient[3]);
 
-/* The same at many points, (count, 3) numbers; phases has one number, or count of them. Scratch may
- * be NULL. With room for BF_SCRATCH numbers a question there, questions that are many, and neither
+/* The same at many points, (count, 3) numbers; phases has one number, or count of them. Gradients may
+ * be NULL, distances not; scratch may be NULL. With room for BF_SCRATCH numbers a question there, questions that are many, and neither
  * whose places nor whose phases follow one another, are answered in an order of its own, several
  * times as fast; the answers are the same. Answers may not lie where the questions do. */
 bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
                        const double *phases, size_t phase_count, double *distances_mm,
                        double *gradients, double *scratch);
 
-/* Potential of a fixture, in [0, 1). */
+/* Potential of a fixture, 0 to 1. */
 bf_status bf_potential(const bf_field *field, int fixture, const double point_mm[3], double phase,
                        double *potential);
 
-/* Force of a fixture on a tool's point, newtons. */
+/* Force of a fixture on a tool's point, newtons, in the frame of the MR. */
 bf_status bf_force(const bf_field *field, int fixture, const double point_mm[3], double phase,
                    double force_n[3]);
 
@@ -146,11 +159,13 @@ typedef struct {
     double handle_mm[3]; /* where the hand holds it: torque is about this point */
 } bf_tool;
 
-/* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL):
- * the mean of the field's force over the tool's length, so no tool feels more than f_max. Pieces
+/* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL), both
+ * in the frame of the MR: the mean of the field's force over the tool's length, so no tool feels more than f_max. Pieces
  * are halved where the field demands it, until the error of the force is below bound_n; evaluations
  * (may be NULL) says how often the field was asked. mr_from_tool is a rotation and a shift, within
- * 1e-3, row after row; the last row is 0 0 0 1. */
+ * 1e-3, row after row; the last row is 0 0 0 1. A tool longer than 20 times the grid's diagonal is
+ * in another unit: BF_WRONG_SIZE. How long an answer takes grows with the tool's length in the field's
+ * reach and its number of points, and as bound_n becomes less. */
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
@@ -160,7 +175,10 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
  * of the force that would drive the motion on is withheld. Off unless it is used:
  *
  *     bf_tank tank = bf_full_tank(5, 20);               5 mJ to begin with, 20 mJ at most
- *     each tick: bf_force(...); bf_pass(&tank, point_mm, force_n);
+ *     each tick: bf_force(...); fade, clip to the device's force; bf_pass(&tank, point_mm, force_n);
+ *
+ * It counts what it passes, so that must be what the hand gets: whatever else is done to the force is
+ * done before. Of a tool point_mm is where the hand holds it; what a torque does is not counted.
  */
 typedef struct {
     double level_mj, capacity_mj;
@@ -168,13 +186,20 @@ typedef struct {
     int started;
 } bf_tank;
 
+/* A tank that holds level_mj to begin with, and capacity_mj at most; what is no number, or less than
+ * nothing, is 0. */
 bf_tank bf_full_tank(double level_mj, double capacity_mj);
 
-/* What may be rendered of a force, in place, at the tool's present point. */
+/* What may be rendered of a force, in place, at the tool's present point. Where one of them is not
+ * finite, nothing may. */
 void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3]);
 
 /* target = transform * point; the arrays may be the same. */
 void bf_transform(const double transform[16], const double point_mm[3], double moved_mm[3]);
+
+/* A direction, such as a force, in the target's frame as it is in the source's: turned back, not
+ * shifted. The arrays may be the same. */
+void bf_turn_back(const double transform[16], const double vector[3], double turned[3]);
 
 /* Parse the text of a store's zarr.json; bf_open does it, this is for tests. */
 bf_status bf_describe(bf_field *field, const char *text, size_t length);
@@ -186,6 +211,13 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 
 #ifdef BEATFIELD_IMPLEMENTATION
 #undef BEATFIELD_IMPLEMENTATION
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "beatfield.h tells what is no number from what is one: compile without -ffast-math"
+#endif
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "beatfield.h reads stores as they are, which are little-endian"
+#endif
+#include <errno.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -225,6 +257,7 @@ const char *bf_text(bf_status status)
     case BF_NOT_FINITE: return "a coordinate or phase is not finite";
     case BF_NOT_RIGID: return "mr_from_tool is no rotation and shift within 1e-3, row after row";
     case BF_WRONG_BOUND: return "bound_n must be above 0";
+    case BF_REPLACED: return "the store was replaced while it was opened: open it again";
     }
     return "unknown status";
 }
@@ -436,6 +469,32 @@ static int bf__entries(bf__json j)
 
 enum { BF__MOST_PHASES = 4096, BF__MOST_PARTS = 1024 };
 
+/* Whether a 4x4 is a rotation and a shift, within 1e-3. */
+static int bf__rigid(const double t[16])
+{
+    double det, shift = t[3] + t[7] + t[11];
+    int a, b;
+    if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-8)) return 0;
+    if (shift - shift != 0) return 0;
+    for (a = 0; a < 12; a += 4)
+        for (b = 0; b < 12; b += 4) {
+            double dot = t[a] * t[b] + t[a + 1] * t[b + 1] + t[a + 2] * t[b + 2];
+            if (!(fabs(dot - (a == b)) <= 1e-3)) return 0;
+        }
+    det = t[0] * (t[5] * t[10] - t[6] * t[9]) + t[1] * (t[6] * t[8] - t[4] * t[10]) +
+          t[2] * (t[4] * t[9] - t[5] * t[8]);
+    return det > 0;
+}
+
+/* Whether a text at the cursor is the one that is wanted. */
+static int bf__says(bf__json *j, const char *wanted)
+{
+    const char *text;
+    size_t length;
+    bf__string(j, &text, &length);
+    return !j->bad && bf__is(text, length, wanted);
+}
+
 static void bf__grid(bf__json *j, bf_field *field)
 {
     const char *key;
@@ -501,7 +560,7 @@ static void bf__transform(bf__json *j, bf_field *field)
         row++;
     }
     field->registered = row == 4;
-    if (row != 4) j->bad = 1;
+    if (row != 4 || !bf__rigid(field->mr_from_tracker)) j->bad = 1;
 }
 
 static void bf__structures(bf__json *j, bf_field *field)
@@ -530,9 +589,18 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
     const char *key, *text;
     size_t length, span;
     double m = 0;
-    int first = 1;
+    int first = 1, inner, forbidden = -1;
     while (bf__key(j, &first, &key, &length)) {
-        if (bf__is(key, length, "structure")) bf__string(j, structure, size);
+        if (bf__is(key, length, "kind")) {
+            bf__string(j, &text, &span);
+            forbidden = bf__is(text, span, "forbidden_region");
+            if (!forbidden && !bf__is(text, span, "guidance")) j->bad = 1;
+        } else if (bf__is(key, length, "device_limits")) {
+            for (inner = 1; bf__key(j, &inner, &key, &length);) {
+                if (bf__is(key, length, "force_n")) part->device_force_n = bf__number(j);
+                else bf__skip(j, 0);
+            }
+        } else if (bf__is(key, length, "structure")) bf__string(j, structure, size);
         else if (bf__is(key, length, "delta_mm")) part->delta_mm = bf__number(j);
         else if (bf__is(key, length, "f_max_n")) part->f_max_n = bf__number(j);
         else if (bf__is(key, length, "m")) m = bf__number(j);
@@ -543,7 +611,8 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
         } else if (!bf__is(key, length, "side")) bf__skip(j, 0);
     }
     if (!(m >= 1 && m <= 1000) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
-        !(part->f_max_n > 0 && part->f_max_n < 1e9))
+        !(part->f_max_n > 0 && part->f_max_n < 1e9) || forbidden != (part->side != 0) ||
+        (part->device_force_n != 0 && !(part->f_max_n <= part->device_force_n)))
         j->bad = 1;
     else part->m = (int)m;
 }
@@ -624,9 +693,10 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
     bf__json j, parts;
     const char *key;
     size_t span;
-    int first = 1, version = 0, gridded = 0;
+    int first = 1, version = 0, gridded = 0, n;
     bf_status status;
     memset(field, 0, sizeof *field);
+    for (n = 0; n < 16; n++) field->mr_from_tracker[n] = NAN;
     j.at = text;
     j.end = text + length;
     j.bad = 0;
@@ -636,7 +706,16 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
     while (bf__key(&j, &first, &key, &span)) {
         if (bf__is(key, span, "format_version")) version = bf__number(&j) == 1.0;
         else if (bf__is(key, span, "phases")) bf__phases(&j, field);
-        else if (bf__is(key, span, "rr_s")) field->rr_s = bf__null(&j) ? 0 : bf__number(&j);
+        else if (bf__is(key, span, "rr_s")) {
+            field->rr_s = bf__null(&j) ? 0 : bf__number(&j);
+            if (!(field->rr_s >= 0)) j.bad = 1;
+        } else if (bf__is(key, span, "frame")) j.bad |= !bf__says(&j, "LPS");
+        else if (bf__is(key, span, "unit")) j.bad |= !bf__says(&j, "mm");
+        else if (bf__is(key, span, "periodic")) {
+            bf__blank(&j);
+            j.bad |= j.end - j.at < 4 || memcmp(j.at, "true", 4) != 0;
+            bf__skip(&j, 0);
+        }
         else if (bf__is(key, span, "mr_from_tracker")) bf__transform(&j, field);
         else if (bf__is(key, span, "grid")) {
             bf__grid(&j, field);
@@ -742,26 +821,64 @@ static void bf__sha_end(bf__sha *sha, char text[65])
 
 /* ---- files ---- */
 
-/* folder + "/" + name, newly allocated. */
-static char *bf__join(const char *folder, const char *name, size_t length)
+/* A folder that stays the same one whatever its path leads to meanwhile. */
+typedef struct {
+    const char *path;
+    int number;
+} bf__folder;
+
+static bf_status bf__enter(bf__folder *folder, const char *path)
 {
-    size_t before = strlen(folder);
-    char *path = (char *)malloc(before + length + 2);
+    folder->path = path;
+    folder->number = -1;
+#ifndef _WIN32
+    folder->number = open(path, O_RDONLY | O_DIRECTORY);
+    /* That it is not there says that it is no field, that it may not be read does not. */
+    if (folder->number < 0) return errno == ENOENT || errno == ENOTDIR ? BF_NOT_A_FIELD : BF_CANNOT_READ;
+#endif
+    return BF_OK;
+}
+
+static void bf__leave(bf__folder *folder)
+{
+#ifndef _WIN32
+    close(folder->number);
+#else
+    (void)folder;
+#endif
+}
+
+/* A file of the folder, opened for reading; NULL, and errno says why, where that fails. */
+static FILE *bf__file(const bf__folder *folder, const char *name, size_t length)
+{
+    size_t before = strlen(folder->path) + 1;
+    char *path = (char *)malloc(before + length + 1);
+    FILE *file = NULL;
     if (!path) return NULL;
-    memcpy(path, folder, before);
-    path[before] = '/';
-    memcpy(path + before + 1, name, length);
-    path[before + 1 + length] = 0;
-    return path;
+    memcpy(path, folder->path, before - 1);
+    path[before - 1] = '/';
+    memcpy(path + before, name, length);
+    path[before + length] = 0;
+#ifdef _WIN32
+    file = fopen(path, "rb");
+#else
+    {
+        int number = openat(folder->number, path + before, O_RDONLY);
+        if (number >= 0) {
+            file = fdopen(number, "rb");
+            if (!file) close(number);
+        }
+    }
+#endif
+    free(path);
+    return file;
 }
 
 /* A whole small file, newly allocated. */
-static bf_status bf__read(const char *folder, const char *name, char **text, size_t *length)
+static bf_status bf__read(const bf__folder *folder, const char *name, char **text, size_t *length)
 {
-    char *path = bf__join(folder, name, strlen(name));
-    FILE *file = path ? fopen(path, "rb") : NULL;
+    FILE *file = bf__file(folder, name, strlen(name));
     size_t room = 0, part = 1;
-    free(path);
     *text = NULL;
     *length = 0;
     if (!file) return BF_CANNOT_READ;
@@ -785,10 +902,11 @@ static bf_status bf__read(const char *folder, const char *name, char **text, siz
 }
 
 /* Size and SHA-256 of a file. */
-static bf_status bf__digest(const char *path, double *size, char sha256[65])
+static bf_status bf__digest(const bf__folder *folder, const char *name, size_t length, double *size,
+                            char sha256[65])
 {
     unsigned char buffer[8192];
-    FILE *file = fopen(path, "rb");
+    FILE *file = bf__file(folder, name, length);
     bf__sha sha;
     size_t part;
     if (!file) return BF_CANNOT_READ;
@@ -813,16 +931,23 @@ static int bf__inside(const char *name, size_t length)
     return 1;
 }
 
-/* Compare files with the manifest: all of them, or only the one with that name. */
-static bf_status bf__check(const char *folder, const char *only)
+/* The text of a store's manifest, newly allocated. */
+static bf_status bf__manifest(const bf__folder *folder, char **text, size_t *length)
 {
-    char *text, sha256[65];
+    bf_status status = bf__read(folder, "manifest.json", text, length);
+    return status == BF_CANNOT_READ && errno == ENOENT ? BF_NOT_A_FIELD : status;
+}
+
+/* Compare files with a manifest: all of them, or of one name alone the text that was read. */
+static bf_status bf__check(const bf__folder *folder, const char *text, size_t length, const char *only,
+                           const char *content, size_t content_length)
+{
+    char sha256[65];
     const char *key, *digest;
-    size_t length, span, digest_span;
+    size_t span, digest_span;
     int first = 1, inner, checked = 0;
     bf__json j;
-    bf_status status = bf__read(folder, "manifest.json", &text, &length);
-    if (status != BF_OK) return status == BF_CANNOT_READ ? BF_NOT_A_FIELD : status;
+    bf_status status = BF_OK;
     j.at = text;
     j.end = text + length;
     j.bad = 0;
@@ -831,7 +956,6 @@ static bf_status bf__check(const char *folder, const char *only)
         const char *name = key;
         size_t name_span = span;
         double size = -1, found = -2;
-        char *path;
         digest = NULL;
         digest_span = 0;
         for (inner = 1; bf__key(&j, &inner, &key, &span);) {
@@ -844,18 +968,19 @@ static bf_status bf__check(const char *folder, const char *only)
             break;
         }
         if (only && !bf__is(name, name_span, only)) continue;
-        path = bf__join(folder, name, name_span);
-        if (!path) {
-            status = BF_NO_MEMORY;
-            break;
+        if (only) {
+            bf__sha sha;
+            bf__sha_start(&sha);
+            bf__sha_add(&sha, content, content_length);
+            found = (double)content_length;
+            bf__sha_end(&sha, sha256);
+        } else {
+            status = bf__digest(folder, name, name_span, &found, sha256);
         }
-        status = bf__digest(path, &found, sha256);
-        free(path);
         if (status == BF_OK && found != size) status = BF_WRONG_SIZE;
         if (status == BF_OK && !bf__is(digest, digest_span, sha256)) status = BF_DAMAGED;
         checked++;
     }
-    free(text);
     if (status != BF_OK) return status;
     return j.bad || !checked ? BF_NOT_A_FIELD : BF_OK;
 }
@@ -863,17 +988,27 @@ static bf_status bf__check(const char *folder, const char *only)
 bf_status bf_verify(const char *path)
 {
     bf_field field;
-    bf_status status = bf__check(path, NULL);
+    bf__folder folder;
+    char *text;
+    size_t length;
+    bf_status status = bf__enter(&folder, path);
+    if (status != BF_OK) return status;
+    status = bf__manifest(&folder, &text, &length);
+    if (status == BF_OK) {
+        status = bf__check(&folder, text, length, NULL, NULL, 0);
+        free(text);
+    }
+    bf__leave(&folder);
     if (status == BF_OK) status = bf_open(&field, path);
     if (status == BF_OK) bf_close(&field);
     return status;
 }
 
 /* One file of exactly that many bytes in memory, read-only. */
-static bf_status bf__map(const char *path, size_t bytes, const float **values)
+static bf_status bf__map(const bf__folder *folder, const char *name, size_t bytes, const float **values)
 {
 #ifdef _WIN32
-    FILE *file = fopen(path, "rb");
+    FILE *file = bf__file(folder, name, strlen(name));
     float *copy = (float *)malloc(bytes);
     size_t read = 0;
     if (file && copy) read = fread(copy, 1, bytes, file);
@@ -889,7 +1024,7 @@ static bf_status bf__map(const char *path, size_t bytes, const float **values)
 #else
     struct stat about;
     void *mapped;
-    int file = open(path, O_RDONLY);
+    int file = openat(folder->number, name, O_RDONLY);
     if (file < 0) return BF_CANNOT_READ;
     if (fstat(file, &about) != 0 || (uint64_t)about.st_size != (uint64_t)bytes) {
         close(file);
@@ -903,61 +1038,106 @@ static bf_status bf__map(const char *path, size_t bytes, const float **values)
 #endif
 }
 
-static void bf__unmap(const float *values, size_t bytes)
+static void bf__unmap(const float *values, size_t bytes, int copied)
 {
+    void *start = (void *)(uintptr_t)values;
     if (!values) return;
 #ifdef _WIN32
-    (void)bytes;
-    free((void *)values);
+    (void)bytes, (void)copied;
+    free(start);
 #else
-    munmap((void *)values, bytes);
+    if (copied) free(start);
+    else munmap(start, bytes);
 #endif
 }
 
-bf_status bf_open(bf_field *field, const char *path)
+/* Describe and map the store that a manifest is of. */
+static bf_status bf__open_as(bf_field *field, const bf__folder *folder, const char *manifest, size_t size)
 {
     char *text, name[BF_NAME + 64];
     size_t length;
     int n, k;
-    bf_status status;
-    memset(field, 0, sizeof *field);
-    status = bf__check(path, "zarr.json");
+    bf_status status = bf__read(folder, "zarr.json", &text, &length);
     if (status != BF_OK) return status;
-    status = bf__read(path, "zarr.json", &text, &length);
-    if (status != BF_OK) return status;
-    status = bf_describe(field, text, length);
+    status = bf__check(folder, manifest, size, "zarr.json", text, length);
+    if (status == BF_OK) status = bf_describe(field, text, length);
     free(text);
     for (n = 0; status == BF_OK && n < field->structures; n++) {
         bf_structure_part *part = &field->structure[n];
         part->coefficients = (const float **)calloc((size_t)field->phases, sizeof(float *));
         if (!part->coefficients) status = BF_NO_MEMORY;
         for (k = 0; status == BF_OK && k < field->phases; k++) {
-            char *file;
             snprintf(name, sizeof name, "spline/%s/c/%d/0/0/0", part->name, k);
-            file = bf__join(path, name, strlen(name));
-            status = file ? bf__map(file, field->bytes, &part->coefficients[k]) : BF_NO_MEMORY;
-            free(file);
+            status = bf__map(folder, name, field->bytes, &part->coefficients[k]);
         }
     }
-    if (status != BF_OK) bf_close(field);
     return status;
 }
+
+bf_status bf_open(bf_field *field, const char *path)
+{
+    char *before = NULL, *after = NULL;
+    size_t length, again;
+    bf__folder folder;
+    bf_status status;
+    memset(field, 0, sizeof *field);
+    status = bf__enter(&folder, path);
+    if (status != BF_OK) return status;
+    status = bf__manifest(&folder, &before, &length);
+    if (status == BF_OK) {
+        status = bf__open_as(field, &folder, before, length);
+        /* Files may be written over while they are opened. */
+        if (bf__manifest(&folder, &after, &again) != BF_OK || again != length ||
+            memcmp(before, after, length) != 0)
+            status = BF_REPLACED;
+        if (status != BF_OK) bf_close(field);
+    }
+    free(before);
+    free(after);
+    bf__leave(&folder);
+    return status;
+}
+
+#ifndef _WIN32
+/* Copies in the place of mapped files; all, or none. */
+static bf_status bf__copy(bf_field *field)
+{
+    size_t count = (size_t)field->structures * (size_t)field->phases, at;
+    void **copies = (void **)calloc(count, sizeof(void *));
+    if (!copies) return BF_NO_MEMORY;
+    for (at = 0; at < count; at++) {
+        const bf_structure_part *part = &field->structure[at / (size_t)field->phases];
+        if (posix_memalign(&copies[at], 4096, field->bytes) != 0) break;
+        memcpy(copies[at], part->coefficients[at % (size_t)field->phases], field->bytes);
+    }
+    if (at < count) {
+        while (at--) free(copies[at]);
+        free(copies);
+        return BF_NO_MEMORY;
+    }
+    for (at = 0; at < count; at++) {
+        const float **values = &field->structure[at / (size_t)field->phases].coefficients[at % (size_t)field->phases];
+        bf__unmap(*values, field->bytes, 0);
+        *values = (const float *)copies[at];
+    }
+    free(copies);
+    field->copied = 1;
+    return BF_OK;
+}
+#endif
 
 bf_status bf_lock(bf_field *field)
 {
     bf_status status = BF_OK;
-    volatile float sum = 0;
-    int n, k;
-    size_t at;
-    for (n = 0; n < field->structures; n++)
-        for (k = 0; k < field->phases; k++) {
-            const float *values = field->structure[n].coefficients[k];
-            for (at = 0; at < field->bytes / sizeof(float); at += 4096 / sizeof(float))
-                sum = sum + values[at];
 #ifndef _WIN32
-            if (mlock(values, field->bytes) != 0) status = BF_CANNOT_LOCK;
+    int n, k;
+    if (!field->copied) status = bf__copy(field);
+    for (n = 0; status != BF_NO_MEMORY && n < field->structures; n++)
+        for (k = 0; k < field->phases; k++)
+            if (mlock(field->structure[n].coefficients[k], field->bytes) != 0) status = BF_CANNOT_LOCK;
+#else
+    (void)field; /* opening has copied them */
 #endif
-        }
     return status;
 }
 
@@ -966,7 +1146,7 @@ void bf_close(bf_field *field)
     int n, k;
     for (n = 0; field->structure && n < field->structures; n++) {
         for (k = 0; field->structure[n].coefficients && k < field->phases; k++)
-            bf__unmap(field->structure[n].coefficients[k], field->bytes);
+            bf__unmap(field->structure[n].coefficients[k], field->bytes, field->copied);
         free((void *)field->structure[n].coefficients);
     }
     free(field->structure);
@@ -1177,8 +1357,8 @@ static double bf__sum(const bf_field *field, const bf__place *at, double gradien
             int a;
             for (a = 0; a < 3; a++) {
                 ptrdiff_t n = at->iz[c] * layer + at->iy[b] * width + at->ix[a];
-                node[a] = at->time[0] * at->phase[0][n] + at->time[1] * at->phase[1][n] +
-                          at->time[2] * at->phase[2][n];
+                node[a] = at->time[0] * (double)at->phase[0][n] + at->time[1] * (double)at->phase[1][n] +
+                          at->time[2] * (double)at->phase[2][n];
             }
             line = at->wx[0] * node[0] + at->wx[1] * node[1] + at->wx[2] * node[2];
             plane += at->wy[b] * line;
@@ -1327,7 +1507,7 @@ typedef struct {
     size_t count;
     const double *points_mm, *phases;
     int many_phases;
-    double *first, *rest; /* forces; or distances, and gradients */
+    double *first, *rest; /* forces; or distances, and gradients, or NULL */
     int slabs;            /* into which the grid is cut along z, where questions are sorted */
 } bf__batch;
 
@@ -1369,7 +1549,7 @@ static void bf__write(const bf__batch *batch, size_t n, const double note[4])
         memcpy(batch->first + 3 * n, note, 3 * sizeof(double));
     } else {
         batch->first[n] = note[0];
-        memcpy(batch->rest + 3 * n, note + 1, 3 * sizeof(double));
+        if (batch->rest) memcpy(batch->rest + 3 * n, note + 1, 3 * sizeof(double));
     }
 }
 
@@ -1383,9 +1563,11 @@ static int bf__follow(const bf__batch *batch)
     int far = 0, pair, axis;
     for (pair = 0; pair < PAIRS; pair++) {
         double way = 0, beats;
+        const double *point_mm;
         n = (batch->count - 2) / PAIRS * (size_t)pair;
+        point_mm = batch->points_mm + 3 * n;
         for (axis = 0; axis < 3; axis++)
-            way += fabs(batch->points_mm[3 * n + 3 + axis] - batch->points_mm[3 * n + axis]) * field->per_mm[axis];
+            way += fabs(point_mm[3 + axis] - point_mm[axis]) * field->per_mm[axis];
         beats = bf__when(batch, n + 1) - bf__when(batch, n);
         beats = fabs(beats - floor(beats + 0.5));
         far += way > 4 || beats * field->phases > 2;
@@ -1444,8 +1626,8 @@ static int bf__answer_bin(const bf__batch *batch, int bin, double *notes, size_t
 static int bf__answer_sorted(bf__batch *batch, double *notes)
 {
     unsigned end[BF__BINS + 1];
-    int most = BF__BINS / batch->field->phases, stride = batch->law ? 3 : 1, bin, bins, sound = 1;
-    size_t wanted = 1 + 3 * batch->field->bytes / BF__CACHE, n;
+    int most = BF__BINS / batch->field->phases, bin, bins, sound = 1;
+    size_t wanted = 1 + 3 * batch->field->bytes / BF__CACHE, stride = batch->law ? 3 : 1, n;
     batch->slabs = wanted < (size_t)most ? (int)wanted : most;
     if (batch->slabs > batch->field->shape[2]) batch->slabs = batch->field->shape[2];
     bins = batch->slabs * batch->field->phases;
@@ -1501,7 +1683,7 @@ static int bf__answer_path(const bf__batch *batch)
     size_t n, ahead = 0;
     int sound = 1;
     for (n = 0; n < batch->count; n++) {
-        double slope[3], *to = batch->law ? slope : batch->rest + 3 * n, distance;
+        double slope[3], *to = batch->rest ? batch->rest + 3 * n : slope, distance;
         for (; ahead < batch->count && ahead < n + BF__AHEAD; ahead++) {
             bf__place *at = ring + ahead % BF__AHEAD;
             bf__place_of(batch, ahead, at);
@@ -1528,7 +1710,7 @@ static bf_status bf__answer_all(bf__batch *batch, double *scratch)
 /* Numbers that are no answers made zeros. */
 static void bf__clear(double *numbers, size_t count)
 {
-    if (count) memset(numbers, 0, count * sizeof(double));
+    if (numbers && count) memset(numbers, 0, count * sizeof(double));
 }
 
 bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
@@ -1602,6 +1784,15 @@ void bf_transform(const double t[16], const double point_mm[3], double moved_mm[
     moved_mm[2] = t[8] * x + t[9] * y + t[10] * z + t[11];
 }
 
+void bf_turn_back(const double transform[16], const double vector[3], double turned[3])
+{
+    const double *t = transform;
+    double x = vector[0], y = vector[1], z = vector[2];
+    turned[0] = t[0] * x + t[4] * y + t[8] * z;
+    turned[1] = t[1] * x + t[5] * y + t[9] * z;
+    turned[2] = t[2] * x + t[6] * y + t[10] * z;
+}
+
 /* ---- whole tools ---- */
 
 typedef struct {
@@ -1614,7 +1805,7 @@ typedef struct {
     double piece_start_mm, piece_length_mm; /* of the piece that was asked for last */
 } bf__walk;
 
-enum { BF__HALVINGS = 12 };
+enum { BF__HALVINGS = 12, BF__LONGEST = 20 };
 
 static double bf__length(const bf_tool *tool, int piece)
 {
@@ -1712,29 +1903,13 @@ static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, doub
     bf__stretch(walk, middle_mm + way / 2, way, share / 2, &right, depth + 1);
 }
 
-/* Whether a 4x4 whose upper rows are finite is a rotation and a shift, within 1e-3. */
-static int bf__rigid(const double t[16])
-{
-    double det;
-    int a, b;
-    if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-8)) return 0;
-    for (a = 0; a < 12; a += 4)
-        for (b = 0; b < 12; b += 4) {
-            double dot = t[a] * t[b] + t[a + 1] * t[b + 1] + t[a + 2] * t[b + 2];
-            if (!(fabs(dot - (a == b)) <= 1e-3)) return 0;
-        }
-    det = t[0] * (t[5] * t[10] - t[6] * t[9]) + t[1] * (t[6] * t[8] - t[4] * t[10]) +
-          t[2] * (t[4] * t[9] - t[5] * t[8]);
-    return det > 0;
-}
-
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations)
 {
     bf__walk walk;
     bf__feel feel;
-    double total = 0, length, sum;
+    double total = 0, length, sum, diagonal2 = 0;
     int n, stretches;
     memset(force_n, 0, 3 * sizeof(double));
     if (torque_nmm) memset(torque_nmm, 0, 3 * sizeof(double));
@@ -1756,6 +1931,11 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     walk.pieces = tool->closed ? tool->count : tool->count - 1;
     for (n = 0; n < walk.pieces; n++) total += bf__length(tool, n);
     if (total - total != 0) return BF_NOT_FINITE;
+    for (n = 0; n < 3; n++) {
+        double edge = (field->shape[n] - 1) * field->spacing_mm[n];
+        diagonal2 += edge * edge;
+    }
+    if (total > BF__LONGEST * sqrt(diagonal2)) return BF_WRONG_SIZE;
     walk.longest_mm = field->spacing_mm[0];
     for (n = 1; n < 3; n++)
         if (field->spacing_mm[n] < walk.longest_mm) walk.longest_mm = field->spacing_mm[n];
@@ -1786,15 +1966,23 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
 {
     bf_tank tank;
     memset(&tank, 0, sizeof tank);
-    tank.level_mj = level_mj;
-    tank.capacity_mj = capacity_mj;
+    tank.capacity_mj = capacity_mj > 0 ? capacity_mj : 0;
+    tank.level_mj = level_mj > 0 ? level_mj : 0;
+    if (tank.level_mj > tank.capacity_mj) tank.level_mj = tank.capacity_mj;
     return tank;
 }
 
 void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
 {
-    double way[3], way2 = 0, work = 0, ahead = 0, allowed, share;
+    double way[3], way2 = 0, work = 0, ahead = 0, sound = 0, allowed, share;
     int axis;
+    for (axis = 0; axis < 3; axis++) sound += point_mm[axis] + force_n[axis];
+    if (sound - sound != 0) {
+        /* No force holds from here on, so none of its work is counted wherever the tool goes. */
+        memset(tank->force_n, 0, sizeof tank->force_n);
+        force_n[0] = force_n[1] = force_n[2] = 0;
+        return;
+    }
     if (!tank->started) {
         memcpy(tank->point_mm, point_mm, sizeof tank->point_mm);
         tank->started = 1;

@@ -15,13 +15,15 @@
  *     bf_force(&field, 0, point_mm, now.phase, force_n);
  *     for (int i = 0; i < 3; i++) force_n[i] *= now.fade;
  *
- * Times are seconds on one clock that never runs back; a beat more than 3 s ahead of it is refused.
+ * Times are seconds on one clock, that of the R peaks and of the loop alike; no heart has beaten before
+ * it beats, so a beat that lies ahead of the time asked for is forgotten, with all before it.
  * Phases are those of one nominal beat, of the length the field was baked for: systole keeps its
  * length when the rate changes (Weissler, Harris and Schoenfeld, Circulation 37:149-159, 1968), atria
  * contract 120 ms before R, diastole gives way.
  * The phase does not jump where it is valid: it is corrected by running at half to one and a half
  * times its speed. What pipeline.registration.clock says in Python, this says with the same numbers.
- * One clock belongs to one thread.
+ * From samples of an ECG to R peaks: pipeline.registration.rpeaks, in Python; here beats are told.
+ * One clock belongs to one thread. Not for -ffast-math, which takes what is no number for one.
  */
 #ifndef BEATFIELD_CLOCK_H
 #define BEATFIELD_CLOCK_H
@@ -58,6 +60,7 @@ typedef struct {
 
 typedef struct {
     double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
+    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it */
     double now_s;
     int started;
     double phase, sd;
@@ -74,22 +77,28 @@ typedef struct {
     double fade;      /* share of the force to render, in [0, 1] */
 } bf_tick;
 
-/* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. */
+/* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. With a
+ * cycle outside 0.2 to 3 s, or a rate that is not above 0 or not finite, it is never valid and its
+ * fade stays 0. Of a monitor that tells beats later than 0.14 s after R, set clock.latency_s: a
+ * beat that is overdue is noticed so much later. */
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
 
-/* An R peak became known, as a rule within 0.14 s: the clock waits no longer for one that is due.
- * strange: its shape is unlike the others'. BF_NO_BEAT, and nothing changes, when it is no later than
- * the last, or more than 3 s after the latest time told by bf_now or by a beat: so far ahead it was
- * timed by another clock, or in another unit. */
+/* An R peak became known, as a rule within clock.latency_s: the clock waits no longer for one that is
+ * due. strange: its shape is unlike the others'. BF_NO_BEAT, and nothing changes, when it is no later
+ * than the last, or more than 3 s after the latest time told by bf_now or by a beat: so far ahead it
+ * was timed by another clock, or in another unit. */
 bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
 
 /* The last beat was none, as a P wave that its R followed: know what was known before it. To be told
  * at once, before the beat that shows it; what was rendered since stays, and is corrected. */
 void bf_take_back(bf_clock *clock);
 
-/* Phase now; usable: some lead is connected. Beats told before, but more than 3 s after it, are
- * forgotten, and the rhythm is learnt anew. Returns 0, or -1 when the time is no number or lies
- * before the last one: then nothing changes and the tick repeats the last. */
+/* Phase now; usable: some lead is connected. Where the last beat lies more than 0.02 s ahead, beats and
+ * loop are timed by different clocks: all are forgotten, and the rhythm is learnt anew. Returns 0, or
+ * -1 when the time is no number or lies before the last one. Up to 0.02 s before, nothing changes.
+ * Otherwise the phase is not valid, beats are forgotten, the fade falls as in a millisecond, and
+ * from then on time is counted from there. In one call the fade moves by 0.02 s' worth at most,
+ * however long the loop was held up. */
 int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
 
 /* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. */
@@ -106,6 +115,9 @@ double bf_to_cycle(double phase, double rr_s, double cycle_rr_s);
 
 #include <math.h>
 #include <string.h>
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "beatfield_clock.h tells what is no number from what is one: compile without -ffast-math"
+#endif
 
 #ifdef __cplusplus
 extern "C" {
@@ -113,6 +125,8 @@ extern "C" {
 
 #define BFC_PI 3.14159265358979323846
 #define BFC_LATENCY_S 0.14
+#define BFC_SHORTEST_RR_S 0.2
+#define BFC_LONGEST_RR_S 3.0
 #define BFC_R_SD_S 0.002
 #define BFC_REGULAR 0.10
 #define BFC_MOST 0.17
@@ -123,6 +137,8 @@ extern "C" {
 #define BFC_IRREGULAR 0.075
 #define BFC_ORDERLY 0.05
 #define BFC_AHEAD_S 3.0
+#define BFC_SLACK_S 0.02
+#define BFC_TICK_S 0.001
 
 static double bfc_min(double a, double b) { return b < a ? b : a; }
 static double bfc_max(double a, double b) { return b > a ? b : a; }
@@ -172,8 +188,14 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
     bf_clock clock;
     memset(&clock, 0, sizeof clock);
     clock.known.rhythm = BF_LOST;
-    clock.cycle_rr_s = cycle_rr_s;
-    clock.fade_per_s = fade_per_s;
+    clock.latency_s = BFC_LATENCY_S;
+    if (cycle_rr_s >= BFC_SHORTEST_RR_S && cycle_rr_s <= BFC_LONGEST_RR_S && fade_per_s > 0.0 &&
+        isfinite(fade_per_s)) {
+        clock.cycle_rr_s = cycle_rr_s;
+        clock.fade_per_s = fade_per_s;
+    } else {
+        clock.cycle_rr_s = 0.8; /* so that numbers stay numbers */
+    }
     bfc_forget(&clock);
     return clock;
 }
@@ -379,7 +401,7 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
         c->known.good = 0;
         c->valid = 0;
         c->known.gap = 1;
-    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + BFC_LATENCY_S) {
+    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + c->latency_s) {
         c->known.rhythm = c->known.rhythm == BF_REGULAR ? BF_LOST : c->known.rhythm;
         c->known.good = 0;
         c->valid = 0;
@@ -408,21 +430,38 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
     c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
     near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
     c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed &&
-               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough;
+               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough && c->fade_per_s > 0.0;
+}
+
+/* A time that is none, or of another clock: what beats told of is worth nothing any more. */
+static void bfc_lose_time(bf_clock *c, double now_s)
+{
+    if (now_s >= c->now_s - BFC_SLACK_S)
+        return;
+    bfc_forget(c);
+    c->known.rhythm = BF_LOST;
+    c->known.good = 0;
+    c->valid = 0;
+    c->fade = bfc_max(c->fade - c->fade_per_s * BFC_TICK_S, 0.0);
+    if (isfinite(now_s))
+        c->now_s = now_s;
 }
 
 int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
 {
     int wrong = !isfinite(now_s) || (c->started && now_s < c->now_s);
-    if (!wrong) {
+    if (wrong) {
+        bfc_lose_time(c, now_s);
+    } else {
         double passed_s = c->started ? now_s - c->now_s : 0.0;
-        double reach = c->fade_per_s * passed_s;
+        double reach = c->fade_per_s * bfc_min(passed_s, BFC_SLACK_S);
         c->started = 1;
         c->now_s = now_s;
-        /* Told before the first question, so there was nothing to hold it against. Left in, it
-         * would make every true beat one that comes too late. */
-        if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_AHEAD_S)
+        /* Left in, it would shift the phase, and make true beats come too late. */
+        if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_SLACK_S) {
             bfc_forget(c);
+            c->valid = 0;
+        }
         bfc_watch(c, now_s, usable);
         bfc_turn(c, now_s - passed_s, now_s);
         c->fade += bfc_min(bfc_max((double)c->valid - c->fade, -reach), reach);

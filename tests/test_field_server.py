@@ -1,0 +1,236 @@
+"""What a force server meets beside good questions: spoilt files, no tracker, tools in metres."""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from field_baked import bake_small
+from scipy.spatial.transform import Rotation
+from test_field_header import HERE, SANITIZE, build, run
+
+from pipeline.errors import InputError
+from pipeline.field import ForceField, files, get_include
+from pipeline.field.manifest import write_manifest
+from pipeline.field.passivity import EnergyTank
+from pipeline.field.tool import Needle
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("server") / "field.zarr"
+    bake_small(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    target = tmp_path_factory.mktemp("c") / "server"
+    return build(HERE / "field_server_driver.c", target, "-std=c99", *SANITIZE)
+
+
+def described(path, target, **changes):
+    """The store with other words in its description, sealed anew."""
+    shutil.copytree(path, target)
+    content = json.loads((target / "zarr.json").read_text())
+    field = content["attributes"]["beatfield"]
+    for key, value in changes.items():
+        *parents, last = key.split("__")
+        part = field
+        for name in parents:
+            part = part[name]
+        part[last] = value
+    (target / "zarr.json").write_text(json.dumps(content))
+    (target / "manifest.json").unlink()
+    write_manifest(target)
+    return target
+
+
+def test_gradients_may_be_left_out(path, program):
+    assert run(program, path, "gradients").stdout == b"1\n"
+
+
+def test_a_tank_of_nonsense_holds_nothing_and_no_number_passes_it(path, program):
+    assert run(program, path, "tank").stdout == b"1\n"
+    tank = EnergyTank(1.0, 20.0)
+    assert tank.passed((0, 0, 0), (2, 0, 0)) == (2, 0, 0)
+    assert tank.passed((float("nan"), 0, 0), (2, 0, 0)) == (0, 0, 0)
+    assert tank.passed((0, 0, 0), (float("inf"), 0, 0)) == (0, 0, 0)
+    assert tank.level_mj == 1
+    assert tank.passed((1, 0, 0), (2, 0, 0)) == (1, 0, 0)
+
+
+@pytest.mark.parametrize("spoil", ["cut", "overwritten"])
+def test_locked_values_are_not_those_of_the_files_any_more(path, program, tmp_path, spoil):
+    store = tmp_path / "field.zarr"
+    shutil.copytree(path, store)
+    running = subprocess.Popen(
+        [program, store, "lock"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert running.stdout.readline() == "locked\n"
+    for chunk in store.glob("spline/*/c/*/0/0/0"):
+        if spoil == "cut":
+            os.truncate(chunk, 0)
+        else:
+            with chunk.open("r+b") as file:
+                file.write(b"\xff" * chunk.stat().st_size)
+    said, _ = running.communicate("go\n", timeout=60)
+    assert (said, running.returncode) == ("1\n", 0)
+
+
+def test_points_and_forces_go_between_tracker_and_mr(path, program, tmp_path):
+    turn = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, (3.0, -2.0, 1.0)
+    store = described(path, tmp_path / "f.zarr", mr_from_tracker=pose.tolist())
+    head, vector = run(program, store, "tracker").stdout.splitlines()
+    assert head == b"1 0"
+    moved = turn @ (9, 4, 2) + pose[:3, 3]
+    np.testing.assert_allclose([float(x) for x in vector.split()], turn.T @ moved, atol=1e-12)
+
+
+def test_without_a_registration_no_trackers_point_gets_a_force(path, program, tmp_path):
+    store = described(path, tmp_path / "f.zarr", mr_from_tracker=None)
+    not_finite = 8
+    assert run(program, store, "tracker").stdout.splitlines()[0] == b"0 %d" % not_finite
+
+
+def test_a_tool_in_another_unit_is_refused_at_once(path, program):
+    field = ForceField.open(path)
+    longest_mm = 20 * float(np.linalg.norm(field.grid.upper_mm - field.grid.origin_mm))
+    lengths = (0.99 * longest_mm, 1.01 * longest_mm, 1e12, 1e150)
+    given = " ".join(map(str, lengths)).encode()
+    fine, wrong_size = b"0", b"3"
+    said = run(program, path, "long", given=given).stdout.split()
+    assert said == [fine, wrong_size, wrong_size, wrong_size]
+    field.tool_force(Needle(shape="needle", length_mm=lengths[0]), np.eye(4), 0.0)
+    for length_mm in lengths[1:3]:
+        with pytest.raises(InputError, match=r"longer than 20 diagonals"):
+            field.tool_force(Needle(shape="needle", length_mm=length_mm), np.eye(4), 0.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"frame": "RAS"},
+        {"unit": "m"},
+        {"periodic": False},
+        {"rr_s": -3.0},
+        {"mr_from_tracker": np.diag([1e3, 1e3, 1e3, 1]).tolist()},
+        {"mr_from_tracker": np.diag([-1.0, 1, 1, 1]).tolist()},
+        {"mr_from_tracker": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [9, 9, 9, 9]]},
+        {"fixtures__guide__kind": "attract"},
+        {"fixtures__guide__side": "outside"},
+        {"fixtures__stay_out__side": None},
+        {"fixtures__guide__f_max_n": 50.0},
+    ],
+)
+def test_c_and_python_refuse_the_same_descriptions(path, program, tmp_path, changes):
+    assert run(program, described(path, tmp_path / "same.zarr")).stdout == b"opened\n"
+    store = described(path, tmp_path / "f.zarr", **changes)
+    with pytest.raises(InputError):
+        ForceField.open(store)
+    assert run(program, store).stdout.startswith(b"no complete field")
+
+
+def replaced(path, other, at):
+    """A folder in the place of another, as baking anew puts it there."""
+    shutil.copytree(path, at / "live.zarr")
+    shutil.copytree(other, at / "new.zarr")
+
+    def swap() -> None:
+        (at / "live.zarr").rename(at / "old.zarr")
+        (at / "new.zarr").rename(at / "live.zarr")
+
+    return at / "live.zarr", swap
+
+
+def test_a_store_that_is_replaced_meanwhile_is_not_mixed_with_the_other(
+    path, tmp_path, monkeypatch
+):
+    other = described(path, tmp_path / "other.zarr", rr_s=1.7)
+    live, swap = replaced(path, other, tmp_path)
+    read = files.read_metadata
+
+    def read_late(store: Path):
+        about = read(store)
+        swap()
+        return about
+
+    monkeypatch.setattr("pipeline.field.reader.read_metadata", read_late)
+    with pytest.raises(InputError, match="was replaced while it was opened"):
+        ForceField.open(live)
+    monkeypatch.undo()
+    assert ForceField.open(live).rr_s == 1.7
+
+
+WATCHED = r"""
+#include <fcntl.h>
+#include <unistd.h>
+#define openat own_openat
+int own_openat(int folder, const char *name, int how);
+#define BEATFIELD_IMPLEMENTATION
+#include "beatfield.h"
+#undef openat
+int own_openat(int folder, const char *name, int how)
+{
+    static int asked;
+    if (asked++ == 3 && system(getenv("SWAP")) != 0) return -1;
+    return openat(folder, name, how);
+}
+int main(int count, char **words)
+{
+    bf_field field;
+    bf_status status = count > 1 ? bf_open(&field, words[1]) : BF_CANNOT_READ;
+    printf("%s %g\n", bf_text(status), status == BF_OK ? field.rr_s : 0);
+    if (status == BF_OK) bf_close(&field);
+    return 0;
+}
+"""
+
+
+def test_c_opens_one_store_however_it_is_swapped_meanwhile(path, tmp_path):
+    """Links turned, folders renamed, and files written over, after three of them were opened."""
+    other = described(path, tmp_path / "other.zarr", rr_s=1.7)
+    (tmp_path / "watched.c").write_text(WATCHED)
+    program = build(tmp_path / "watched.c", tmp_path / "watched", "-std=gnu99")
+    link = tmp_path / "link.zarr"
+    link.symlink_to(path)
+    first = run(program, link, SWAP="true").stdout
+    assert first == b"done %g\n" % ForceField.open(path).rr_s
+    assert run(program, link, SWAP=f"ln -sfn {other} {link}").stdout == first
+    assert run(program, link, SWAP="true").stdout == b"done 1.7\n"
+    live, _ = replaced(path, other, tmp_path)
+    swap = f"mv {live} {tmp_path}/old.zarr && mv {tmp_path}/new.zarr {live}"
+    assert run(program, live, SWAP=swap).stdout == first
+    assert run(program, live, SWAP=f"cp -r {path}/. {live}").stdout == (
+        b"the store was replaced while it was opened: open it again 0\n"
+    )
+
+
+def test_a_compiler_that_takes_no_numbers_for_numbers_is_refused(tmp_path):
+    command = ["gcc", "-Ofast", f"-I{get_include()}", "-c", str(HERE / "field_driver.c")]
+    done = run(*command, "-o", tmp_path / "out.o")
+    assert done.returncode != 0
+    assert b"compile without -ffast-math" in done.stderr
+
+
+@pytest.mark.parametrize("standard", ["gnu99", "gnu17"])
+def test_other_declarations_are_left_to_the_program(tmp_path, standard):
+    source = tmp_path / "own.c"
+    source.write_text(
+        '#define BEATFIELD_IMPLEMENTATION\n#include "beatfield.h"\n#include <unistd.h>\n'
+        "int main(void) { return usleep(0) || M_PI < 3; }\n"
+    )
+    build(source, tmp_path / "own", f"-std={standard}")
+
+
+@pytest.mark.parametrize("phase", [1e17, 1e19, -1e19, 1e300])
+def test_of_any_phase_only_the_fraction_counts(path, phase):
+    field = ForceField.open(path)
+    assert field.force_at(9.0, 4.0, 2.0, phase) == field.force_at(9.0, 4.0, 2.0, 0.0)
