@@ -1,4 +1,4 @@
-/* Reads rows of (what, time, flag): what 0 is a beat, 1 a question, 2 takes a beat back. Writes what came back. */
+/* Reads rows of (what, time, flag): what 0 is a beat, 1 a question (flag 2: withheld), 2 takes a beat back. Writes what came back. */
 #include <stdio.h>
 
 #define BEATFIELD_CLOCK_IMPLEMENTATION
@@ -20,6 +20,7 @@ int main(void)
             bf_take_back(&clock);
         } else {
             bf_tick tick;
+            clock.withheld = row[2] > 1.0;
             out[0] = bf_now(&clock, row[1], row[2] > 0.0, &tick);
             out[1] = tick.phase;
             out[2] = tick.sd;

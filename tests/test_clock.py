@@ -241,7 +241,6 @@ def test_a_time_of_another_clock_ends_validity_at_the_fades_own_rate(wrong_s):
     assert steps.max() <= 5.0 * 0.02 + 1e-9
     assert (steps[1:] <= 5.0 * TICK_S + 1e-6).all()
     assert fades[-1] == 0
-    # And it learns anew.
     again = beating(clock, start_s + 40.0, start_s=start_s + 10.0)
     assert again[-1].valid
     assert again[-1].fade == 1
@@ -265,6 +264,17 @@ def test_the_fade_does_not_leap_after_a_stall():
     assert before.valid
     assert after.valid
     assert after.fade - before.fade == pytest.approx(5.0 * 0.02)
+
+
+def test_a_force_that_is_withheld_fades_and_the_rhythm_is_kept():
+    clock = PhaseClock(0.8, f_max_n=2.0, force_rate_n_per_s=10.0)
+    assert beating(clock, 19.5)[-1].fade == 1
+    fades = [clock.at(19.5 + 0.01 * k, withheld=True).fade for k in range(31)]
+    np.testing.assert_allclose(-np.diff(fades[:19]), 0.05)
+    assert fades[-1] == 0
+    again = clock.at(19.81)
+    assert again.valid
+    assert again.fade == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(("late_s", "waits_s", "valid"), [

@@ -53,7 +53,8 @@ def stream(rng: np.random.Generator) -> np.ndarray:
         step_s = rr_s * {0: 0.65, 1: 1.4, 2: 3.5, 3: rng.uniform(0.5, 1.5)}.get(int(mood), 1.0)
         lost = mood == 4
         while now_s < r_s + 0.13:
-            rows.append((1, now_s, not (lost and rng.random() < 0.5)))
+            withheld = mood == 12 and rng.random() < 0.5
+            rows.append((1, now_s, 2 * withheld or not (lost and rng.random() < 0.5)))
             now_s += float(rng.uniform(0.001, 0.05))
         if mood == 5:
             rows.append((1, now_s - rng.choice([5.0, 0.015, 0.025]), True))
@@ -85,7 +86,7 @@ def by_python(rows: np.ndarray, cycle_rr_s: float) -> np.ndarray:
         elif what == 2:
             clock.take_back()
         else:
-            row[0] = ticks.advance(c, time_s, bool(flag))
+            row[0] = ticks.advance(c, time_s, flag > 0, flag > 1)
             row[1:] = c[[ticks.PHASE, ticks.SD, ticks.STATE, ticks.VALID, ticks.FADE]]
     return out
 

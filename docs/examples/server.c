@@ -6,8 +6,9 @@
  *     ./server OUT/patient-0001/bake/field.zarr peaks.csv X Y Z > forces.csv
  *
  * plays the peaks when they became known and holds the tool's tip at one point of the MR, in LPS
- * millimetres. A real server does the same with the peaks of its monitor, its own time, and a tip
- * that field.mr_from_tracker takes from the tracker's frame to that of the MR.
+ * millimetres. A real server does the same with the peaks of its monitor, timed by the clock of its own
+ * loop; with a tip that bf_transform(field.mr_from_tracker, ...) takes from the tracker's frame to
+ * that of the MR, where field.registered; and turns the force back by bf_turn_back for its device.
  */
 #define BEATFIELD_IMPLEMENTATION
 #define BEATFIELD_CLOCK_IMPLEMENTATION
@@ -92,9 +93,11 @@ static bf_status serve(const bf_field *field, peak_table *peaks, const double ti
             bf_beat(&clock, next.r_s, next.strange);
             more = next_peak(peaks, &next);
         }
+        clock.withheld = !bf_contains(field, tip_mm);
         bf_now(&clock, time_s, lead_connected, &now);
         status = bf_force(field, 0, tip_mm, now.phase, force_n);
-        /* Fading is all that a lost lead, an early beat or fibrillation asks of a server. */
+        /* Fading is all that a lost lead, an early beat, fibrillation or a tip that leaves the grid
+         * asks of a server. */
         printf("%.3f,%.6f,%d,%.6f,%.6f,%.6f,%.6f\n", time_s, now.phase, now.valid, now.fade,
                now.fade * force_n[0], now.fade * force_n[1], now.fade * force_n[2]);
     }

@@ -3,8 +3,9 @@
     python docs/examples/server.py FIELD ECG X Y Z > forces.csv
 
 plays a recording (WFDB, CSV or DICOM) as a monitor would send it and holds the tool's tip at one
-point of the MR, in LPS millimetres. A real server does the same with its own samples, time and tip,
-which `field.mr_from_tracker` takes from the tracker's frame to that of the MR.
+point of the MR, in LPS millimetres. A real server does the same with its own samples, whose R times
+it counts on the clock of its loop; with a tip that `field.mr_from_tracker` takes from the tracker's
+frame to that of the MR; and turns the force back by the transposed rotation for its device.
 """
 
 import sys
@@ -37,9 +38,11 @@ def serve(field: ForceField, ecg: Ecg, tip_mm: tuple[float, float, float]) -> It
         for beat in detector.push(ecg.signal_mv[seen:arrived]):
             tell(clock, beat)
         seen = arrived
-        tick = clock.at(passed_s, detector.usable)
+        outside = not field.contains([tip_mm])[0]
+        tick = clock.at(passed_s, detector.usable, withheld=outside)
         force_n = field.force_at(*tip_mm, tick.phase, fixture)
-        # Fading is all that a lost lead, an early beat or fibrillation asks of a server.
+        # Fading is all that a lost lead, an early beat, fibrillation or a tip that leaves the grid
+        # asks of a server.
         x_n, y_n, z_n = (tick.fade * part for part in force_n)
         yield ecg.start_s + passed_s, tick.phase, tick.valid, tick.fade, x_n, y_n, z_n
 

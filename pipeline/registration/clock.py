@@ -57,7 +57,7 @@ class Tick:
     """Whether the phase can be relied on. False in every state but ``regular``."""
 
     fade: float
-    """Share of a fixture's force to render, in [0, 1]: goes to 1 while valid, to 0 while not."""
+    """Share of a fixture's force to render, in [0, 1]: goes to 1 while valid and not withheld."""
 
 
 class PhaseClock:
@@ -128,7 +128,7 @@ class PhaseClock:
         """
         ticks.take_back(self._state)
 
-    def at(self, now_s: float, usable: bool = True) -> Tick:
+    def at(self, now_s: float, usable: bool = True, *, withheld: bool = False) -> Tick:
         """Phase now.
 
         Where the last beat lies more than 0.02 s ahead of it, beats and questions are timed by
@@ -141,6 +141,9 @@ class PhaseClock:
             Seconds; never before the time last asked for.
         usable
             Whether any lead of the electrocardiogram is connected.
+        withheld
+            Whether no force is wanted now, as of a tool outside the field's grid: the fade goes to
+            0, and the rhythm is followed as ever.
 
         Raises
         ------
@@ -150,7 +153,7 @@ class PhaseClock:
         """
         c = self._state
         before_s = c[ticks.NOW]
-        if ticks.advance(c, float(now_s), bool(usable)) < 0:
+        if ticks.advance(c, float(now_s), bool(usable), bool(withheld)) < 0:
             raise InputError(f"clock: asked for {now_s} s after {before_s} s; time must rise")
         return Tick(
             float(c[ticks.PHASE]),

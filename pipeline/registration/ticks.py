@@ -305,7 +305,7 @@ def _place(c: Float, now_s: float, rr_s: float) -> float:
 
 
 @compiled
-def advance(c: Float, now_s: float, usable: bool) -> int:
+def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
     """Bring the clock to ``now_s``; -1 when that is no time at or after the last.
 
     Afterwards ``c`` holds phase, its standard deviation, state, validity and fade.
@@ -323,7 +323,8 @@ def advance(c: Float, now_s: float, usable: bool) -> int:
     _watch(c, now_s, usable)
     _turn(c, before_s, now_s)
     reach = c[FADE_PER_S] * min(passed_s, SLACK_S)
-    c[FADE] += min(max(c[VALID] - c[FADE], -reach), reach)
+    wanted = 0.0 if withheld else c[VALID]
+    c[FADE] += min(max(wanted - c[FADE], -reach), reach)
     return 0
 
 

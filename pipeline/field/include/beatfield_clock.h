@@ -11,7 +11,8 @@
  *     (rr_s: field.rr_s, or what a beat lasts usually where that is 0, unknown)
  *     bf_beat(&clock, r_s, 0);                       whenever an R peak becomes known
  *     bf_tick now;
- *     bf_now(&clock, time_s, lead_connected, &now);  in every turn of the loop
+ *     clock.withheld = !bf_contains(&field, point_mm);  in every turn of the loop
+ *     bf_now(&clock, time_s, lead_connected, &now);
  *     bf_force(&field, 0, point_mm, now.phase, force_n);
  *     for (int i = 0; i < 3; i++) force_n[i] *= now.fade;
  *
@@ -61,6 +62,7 @@ typedef struct {
 typedef struct {
     double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
     double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it */
+    int withheld;                  /* 0; set it while no force is wanted, as of a tool outside the grid */
     double now_s;
     int started;
     double phase, sd;
@@ -74,7 +76,7 @@ typedef struct {
     double sd;        /* its standard deviation */
     bf_rhythm rhythm;
     int valid;        /* whether the phase can be relied on */
-    double fade;      /* share of the force to render, in [0, 1] */
+    double fade;      /* share of the force to render, in [0, 1]: to 1 while valid and not withheld */
 } bf_tick;
 
 /* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. With a
@@ -464,7 +466,7 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
         }
         bfc_watch(c, now_s, usable);
         bfc_turn(c, now_s - passed_s, now_s);
-        c->fade += bfc_min(bfc_max((double)c->valid - c->fade, -reach), reach);
+        c->fade += bfc_min(bfc_max((double)(c->valid && !c->withheld) - c->fade, -reach), reach);
     }
     if (tick) {
         tick->phase = c->phase;
