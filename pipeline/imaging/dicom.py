@@ -31,6 +31,9 @@ MR_CLASSES = {
 DIRECTORY, DIRECTORY_NAMES = "1.2.840.10008.1.3.10", ("DICOMDIR", "DICOMDIR;1")
 """Media Storage Directory Storage, and what systems make of its file's name."""
 
+OTHER_IMAGES = (".nrrd", ".nhdr", ".mha", ".mhd", ".hdr", ".img", ".img.gz", ".mgz", ".mat", ".par")
+"""Ends of names of images that other programs write."""
+
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
@@ -99,6 +102,11 @@ def _require_dicom(paths: Sequence[Path]) -> None:
     others = [path for path in paths if not _begins_as_dicom(path)]
     if others:
         more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
+        if others[0].name.lower().endswith(OTHER_IMAGES):
+            raise InputError(
+                f"{others[0]}{more}: is an image, but neither DICOM nor NIfTI; save the cine as "
+                "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
+            )
         raise InputError(
             f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
             "it out of the folder where it does not belong there"
