@@ -133,7 +133,7 @@ int main(int count, char **words)
         return 2;
     }
     if (status == BF_OK) {
-        bf_lock(&field); /* pages in memory before the loop starts; where not allowed, read at least */
+        bf_lock(&field); /* values in memory before the loop starts, whether they may be locked there or not */
         printf("time_s,phase,valid,fade,x_n,y_n,z_n\n");
         status = serve(&field, &peaks, tip_mm);
         bf_close(&field);

@@ -10,7 +10,7 @@
  *
  *     bf_field field;
  *     if (bf_open(&field, "OUT/patient-0001/bake/field.zarr") != BF_OK) ...
- *     bf_lock(&field);                              pages in memory, before the loop starts
+ *     bf_lock(&field);                              values in memory, before the loop starts
  *     int guide = bf_fixture(&field, "epicardium_guidance");
  *     double force_n[3];
  *     bf_force(&field, guide, point_mm, phase, force_n);      as often as you like
