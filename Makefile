@@ -33,15 +33,15 @@ $(READY): requirements.lock pyproject.toml
 	touch $@
 
 demo: $(STUDY)/study.yaml ## a synthetic patient becomes a force field, with a report at the end (SEED=1)
-	$(BIN)/beatfield run $(STUDY) --out $(OUT) --config $(CONFIG) | tee $(OUT).txt
-	@sed -n 's/^query  *beatfield //p' $(OUT).txt | xargs $(BIN)/beatfield
+	$(BIN)/beatfield run "$(STUDY)" --out "$(OUT)" --config "$(CONFIG)" | tee "$(OUT).txt"
+	@sed -n 's/^query  *beatfield //p' "$(OUT).txt" | xargs $(BIN)/beatfield
 
 demo/studies-$(SEED)/patient-0001/study.yaml: $(READY)
 	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite
 
 paper: $(READY) ## the paper's figures and table, re-run from the demo's field: paper/index.html
-	test -d $(OUT)/patient-0001/bake/field.zarr || $(MAKE) demo
-	$(BIN)/beatfield paper paper --products $(OUT)/patient-0001 --study $(STUDY)
+	test -d "$(OUT)/patient-0001/bake/field.zarr" || $(MAKE) demo
+	$(BIN)/beatfield paper paper --products "$(OUT)/patient-0001" --study "$(STUDY)"
 
 test: setup ## run all tests
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
@@ -98,10 +98,10 @@ train: setup ## make the segmentation weights anew from the phantom (seven hours
 	cp training/eleventh/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
-	$(BIN)/beatfield $@ $(STUDY) --out $(OUT) --config $(CONFIG)
+	$(BIN)/beatfield $@ "$(STUDY)" --out "$(OUT)" --config "$(CONFIG)"
 
 batch: setup ## run a folder of studies: make batch STUDIES=... OUT=... WORKERS=2
-	$(BIN)/beatfield batch $(STUDIES) --out $(OUT) --workers $(WORKERS) --config $(CONFIG)
+	$(BIN)/beatfield batch "$(STUDIES)" --out "$(OUT)" --workers $(WORKERS) --config "$(CONFIG)"
 
 clean: ## remove the demo, caches and the virtual environment
 	rm -rf demo paper training $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks

@@ -2,189 +2,257 @@
 
 from __future__ import annotations
 
-import csv
-import json
+import hashlib
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Protocol
 
-from pipeline.errors import InputError
-from pipeline.publish import readable_write_errors
-from pipeline.study import open_study, studies_in
-from pipeline.summary import remarks
+from pipeline.batch_ending import how_it_ended, old_products
+from pipeline.batch_plan import (
+    LOGS,
+    TABLE,
+    Plan,
+    notes_on,
+    plan_batch,
+    products_of,
+    read_record,
+    record_bytes,
+)
+from pipeline.batch_table import INTERRUPTED, NO_STUDY, Ended, Outcome, outcome_of, rows
+from pipeline.batch_table import write_table as write_csv
+from pipeline.errors import NOT_TO_BE_USED, InputError
+from pipeline.publish import PARTIAL, locked, readable_write_errors, remove
 
-NO_STUDY = "no study"
-"""Status of a folder among the studies that is none; nothing was run, and nothing failed."""
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LOOK_S = 0.5
+"""How often the main thread looks for signals: one that came to another does not wake it."""
+
+NAME_BYTES = 255
+"""Most that file systems take for a name."""
+
+
+class BatchWatcher(Protocol):
+    """Whoever shows the user how the batch goes."""
+
+    def ended(self, outcome: Outcome, done: int, total: int) -> None:
+        """A study ended: how many have, and of how many."""
+
+    def interrupted(self, running: int) -> None:
+        """No other study begins; so many are waited for."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """How one patient's run ended."""
+class Batch:
+    """How a batch ended."""
 
-    patient: str
-    status: str
-    """done, failed (the program said why), crashed (it could not) or `NO_STUDY`."""
+    outcomes: list[Outcome]
+    """By name; those of folders that are no study among them."""
 
-    seconds: float
-    lv_ejection_fraction: float | None
-    target_registration_error_mm: float | None
-    largest_distance_error_mm: float | None
-    expected_tre_mm: float | None
-    registration: str
-    """Its verdict; empty where there is none."""
+    notes: list[str]
+    """What lies in either folder and belongs to no study."""
 
-    remarks: str
-    """What `pipeline.summary.remarks` says of it."""
-
-    cause: str
+    interrupted: bool
+    unwritten: InputError | None
+    """Why ``batch.csv`` could not be written, if so."""
 
 
 def run_batch(
-    studies: Path,
-    out: Path,
-    workers: int,
-    config: Path | None,
-    ended: Callable[[Outcome, int, int], None],
-) -> list[Outcome]:
-    """Run every study below ``studies``; write ``out/batch.csv``; return outcomes by name.
+    studies: Path, out: Path, workers: int, config: Path | None, watcher: BatchWatcher
+) -> Batch:
+    """Run every study below ``studies``; write ``out/batch.csv`` after each.
 
-    ``ended`` is told of each that has ended, how many have, and of how many.
-    Folders that are no study are listed among the outcomes, but for hidden ones and ``out``.
+    A signal that ends programs begins no other study and is passed to those that run, which are
+    waited for; SIGINT once more ends them at once.
 
     Raises
     ------
     InputError
-        When the folder is missing or holds no study, or ``out`` cannot be written.
+        When there is nothing to run (see `plan_batch`), ``out`` cannot be written, or another batch
+        is at work in it.
     """
-    if not studies.is_dir():
-        raise InputError(f"{studies}: no such folder; give the folder that holds the studies")
-    folders = studies_in(studies)
-    if not folders:
-        raise InputError(f"{studies}: holds no study (folders with cine/ or study.yaml)")
-    _require_different_patients(folders)
-    logs = out / "logs"
-    with readable_write_errors(logs):
-        logs.mkdir(parents=True, exist_ok=True)
-    outcomes = []
-    with ThreadPoolExecutor(workers) as pool:
-        waiting = [pool.submit(_run_one, folder, out, config) for folder in folders]
-        for finished in as_completed(waiting):
-            outcome = finished.result()
-            outcomes.append(outcome)
-            ended(outcome, len(outcomes), len(folders))
-    outcomes += _no_studies(studies, folders, out)
-    outcomes.sort(key=lambda outcome: outcome.patient)
-    with readable_write_errors(out):
-        _write_csv(out / "batch.csv", outcomes)
-    return outcomes
+    plans = plan_batch(studies, out)
+    with locked(out):
+        for orphan in out.glob(f".{TABLE}{PARTIAL}*"):
+            remove(orphan)
+        with readable_write_errors(out / LOGS):
+            (out / LOGS).mkdir(exist_ok=True)
+        batch = _Running(out, config, watcher, plans)
+        batch.run(workers)
+        return batch.end(studies)
 
 
-def _no_studies(studies: Path, folders: Sequence[Path], out: Path) -> list[Outcome]:
-    others = (path for path in studies.iterdir() if path.is_dir() and path not in folders)
-    return [
-        Outcome(path.name, NO_STUDY, 0.0, *_figures({}), "has neither cine/ nor study.yaml")
-        for path in others
-        if not path.name.startswith(".") and path.resolve() != out.resolve()
-    ]
+class _Children:
+    """The processes that run."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._running: set[subprocess.Popen[bytes]] = set()
+        # Signals may come while the thread that they come to holds it.
+        self._lock = threading.RLock()
+
+    def call(self, command: Sequence[str], log: IO[Any]) -> int | None:
+        """Run a command; return its exit code, or None where none is to be begun any more."""
+        with self._lock:
+            if self.stopped:
+                return None
+            # Children know by the end of their input that this process is no more.
+            child = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
+            )
+            self._running.add(child)
+        with child:
+            code = child.wait()
+        with self._lock:
+            self._running.remove(child)
+        return code
+
+    def stop(self, how: signal.Signals) -> int:
+        """Begin no other, and send a signal to those that run; return how many do."""
+        with self._lock:
+            self.stopped = True
+            for child in self._running:
+                child.send_signal(how)
+            return len(self._running)
 
 
-def _require_different_patients(folders: Sequence[Path]) -> None:
-    """Two studies of one patient id would write into one folder."""
-    seen: dict[str, Path] = {}
-    for folder in folders:
+@contextmanager
+def _passing_signals_on(children: _Children, watcher: BatchWatcher) -> Iterator[None]:
+    """Let signals that end programs stop the children in place of this program.
+
+    Signals that are ignored, as `nohup` does, stay so. Python tells signals to the main thread
+    alone; in another, who runs the batch sees to them.
+    """
+
+    def passed_on(number: int, _frame: object) -> None:
+        if not children.stopped:
+            watcher.interrupted(children.stop(signal.SIGTERM))
+        elif number == signal.SIGINT:
+            children.stop(signal.SIGKILL)
+
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {one: signal.getsignal(one) for one in ENDING}
+    heard = {one: way for one, way in before.items() if way not in (None, signal.SIG_IGN)}
+    for one in heard:
+        signal.signal(one, passed_on)
+    try:
+        yield
+    finally:
+        for one, way in heard.items():
+            signal.signal(one, way)
+
+
+class _Running:
+    def __init__(
+        self, out: Path, config: Path | None, watcher: BatchWatcher, plans: Sequence[Plan]
+    ) -> None:
+        self._out, self._config, self._watcher = out, config, watcher
+        self._plans = plans
+        self._children = _Children()
+        self._ended: list[Ended] = []
+
+    def run(self, workers: int) -> None:
+        """Run all studies that can be, and tell of the others first."""
+        for plan in self._plans:
+            if not plan.is_study:
+                why = "has neither cine/ nor study.yaml"
+                self._ended.append(outcome_of(plan.name, NO_STUDY, why, "", plan.folder))
+            elif plan.refused:
+                self._tell(self._not_done(plan, "failed", plan.refused))
+        able = [plan for plan in self._plans if plan.is_study and not plan.refused]
+        with (
+            _passing_signals_on(self._children, self._watcher),
+            ThreadPoolExecutor(workers) as pool,
+        ):
+            try:
+                waited_for = {pool.submit(self._run_one, one) for one in able}
+                while waited_for:
+                    finished, waited_for = wait(waited_for, LOOK_S, FIRST_COMPLETED)
+                    for one in finished:
+                        self._tell(one.result())
+            except BaseException:
+                # The pool waits for its threads, and they for the children.
+                self._children.stop(signal.SIGTERM)
+                raise
+
+    def end(self, studies: Path) -> Batch:
+        """Write the whole table, and say what else is to be told."""
+        outcomes = rows(self._ended)
+        unwritten = write_csv(self._out / TABLE, outcomes)
+        notes = notes_on(studies, self._out, self._plans)
+        return Batch(outcomes, notes, self._children.stopped, unwritten)
+
+    def _tell(self, one: Ended) -> None:
+        self._ended.append(one)
+        # What cannot be written now may be later; only the last time counts.
+        write_csv(self._out / TABLE, rows(self._ended))
+        total = sum(plan.is_study for plan in self._plans)
+        done = len(self._ended) - (len(self._plans) - total)
+        self._watcher.ended(one.outcome, done, total)
+
+    def _run_one(self, plan: Plan) -> Ended:
         try:
-            patient = open_study(folder).patient_id
-        except InputError:
-            continue  # This patient's own run says what is wrong, and costs only itself.
-        if patient in seen:
-            raise InputError(
-                f"{folder}: has the patient id {patient!r} of {seen[patient]}; "
-                "give each study its own patient_id in study.yaml"
-            )
-        seen[patient] = folder
+            return self._call(plan)
+        except InputError as error:
+            return self._not_done(plan, "failed", str(error))
+        except Exception as error:  # one study's trouble, whatever it is, costs only that study
+            return self._not_done(plan, "crashed", f"{type(error).__name__}: {error}")
+
+    def _call(self, plan: Plan) -> Ended:
+        if self._children.stopped:
+            return self._not_done(plan, INTERRUPTED, "not begun")
+        command = [sys.executable, "-m", "pipeline.batch_member", "run", str(plan.folder)]
+        command += ["--out", str(self._out)]
+        command += ["--config", str(self._config)] if self._config else []
+        log = self._out / LOGS / _log_name(plan.name)
+        before = record_bytes(products_of(self._out, plan))
+        clock = time.perf_counter()
+        with readable_write_errors(log):
+            handle = log.open("w")
+        with handle:
+            code = self._children.call(command, handle)
+        if code is None:
+            return self._not_done(plan, INTERRUPTED, "not begun")
+        seconds = time.perf_counter() - clock
+        status, cause = how_it_ended(code, log, self._children.stopped)
+        if status != "done":
+            return self._not_done(plan, status, cause, seconds, before)
+        products = products_of(self._out, plan)
+        record = read_record(products)
+        if "stages" not in record:
+            lost = products or self._out / (plan.patient_id or plan.name)
+            cause = f"{lost}/run.json: cannot be read though the run ended well; run it again"
+            return self._not_done(plan, "failed", cause, seconds, before)
+        ended = plan.name, status, cause, plan.patient_id, plan.folder
+        return outcome_of(*ended, seconds, record, products)
+
+    def _not_done(
+        self, plan: Plan, status: str, cause: str, seconds: float = 0.0, before: bytes | None = None
+    ) -> Ended:
+        """A study that is not done, and what an earlier run of it left standing."""
+        products = products_of(self._out, plan)
+        if NOT_TO_BE_USED not in cause:
+            known = record_bytes(products) if before is None else before
+            cause = "; ".join(filter(None, (cause, old_products(products, known))))
+        same_study = read_record(products).get("study") == str(plan.folder.resolve())
+        shown = products if same_study else None
+        ended = plan.name, status, cause, plan.patient_id, plan.folder
+        return outcome_of(*ended, seconds, products=shown)
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """The outcomes as text, one line a patient."""
-    head = f"{'patient':24s} {'status':8s} {'seconds':>8s} {'LV EF':>6s} {'TRE mm':>7s}"
-    lines = [f"{head} {'expected':>8s}  {'verdict':8s}  cause or remarks"]
-    for one in outcomes:
-        figures = (
-            f"{'-' if value is None else format(value, '.2f'):>{width}s}"
-            for value, width in (
-                (one.lv_ejection_fraction, 6),
-                (one.target_registration_error_mm, 7),
-                (one.expected_tre_mm, 8),
-            )
-        )
-        lines.append(
-            f"{one.patient:24s} {one.status:8s} {one.seconds:8.1f} {' '.join(figures)}  "
-            f"{one.registration or '-':8s}  {one.cause or one.remarks}"
-        )
-    return "\n".join(lines)
-
-
-def _run_one(study: Path, out: Path, config: Path | None) -> Outcome:
-    command = [sys.executable, "-m", "pipeline", "run", str(study), "--out", str(out)]
-    command += ["--config", str(config)] if config else []
-    log = out / "logs" / f"{study.name}.log"
-    clock = time.perf_counter()
-    with log.open("w") as handle:
-        code = subprocess.call(
-            command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
-        )
-    seconds = time.perf_counter() - clock
-    status, cause = _status(code, log)
-    stages = _stages(out, study) if status == "done" else {}
-    return Outcome(study.name, status, round(seconds, 1), *_figures(stages), cause)
-
-
-def _status(code: int, log: Path) -> tuple[str, str]:
-    if code == 0:
-        return "done", ""
-    lines = log.read_text(errors="replace").splitlines()
-    if code < 0:
-        return "crashed", f"{signal.Signals(-code).name}; see {log}"
-    said = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    if said:
-        return "failed", said[-1]
-    return "crashed", f"{lines[-1] if lines else 'no message'}; see {log}"
-
-
-def _stages(out: Path, study: Path) -> dict[str, Any]:
-    record = json.loads((out / open_study(study).patient_id / "run.json").read_text())
-    stages: dict[str, Any] = record["stages"]
-    return stages
-
-
-def _figures(
-    stages: dict[str, Any],
-) -> tuple[float | None, float | None, float | None, float | None, str, str]:
-    def figure(stage: str, *keys: str) -> float | None:
-        value = stages.get(stage, {}).get("figures", {})
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        return value if isinstance(value, float) else None
-
-    verdict = stages.get("register", {}).get("figures", {}).get("verdict", "")
-    return (
-        figure("surface", "lv_ejection_fraction"),
-        figure("evaluate", "target_registration_error_mm"),
-        figure("bake", "accuracy", "distance_error_max_mm"),
-        figure("register", "expected_tre_mm"),
-        verdict,
-        "; ".join(f"{word}: {text}" for word, text in remarks(stages)),
-    )
-
-
-def _write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
-    with path.open("w", newline="") as handle:
-        rows = csv.DictWriter(handle, [field.name for field in fields(Outcome)])
-        rows.writeheader()
-        rows.writerows(asdict(outcome) for outcome in outcomes)
+def _log_name(patient: str) -> str:
+    """Name of a patient's log; a folder's name may leave no room for the ending."""
+    name = os.fsencode(patient)
+    if len(name) + len(".log") <= NAME_BYTES:
+        return f"{patient}.log"
+    # The digest keeps two names apart that begin in the same way.
+    return f"{os.fsdecode(name[:200])}-{hashlib.sha256(name).hexdigest()[:8]}.log"

@@ -1,4 +1,4 @@
-"""The command line: the only part that prints, and that ends the program.
+"""The command line: the only part that prints (with `pipeline.console`) and ends the program.
 
 Exit codes: 0 done, 1 a stage failed, 2 the input or the command is wrong, 130 interrupted.
 Heavy libraries are imported inside the commands, so that ``--help`` answers at once.
@@ -7,11 +7,9 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +17,7 @@ from typing import Annotated, Any
 from cyclopts import App, CycloptsError, Parameter
 
 from pipeline import __version__
+from pipeline.console import BatchConsole, Console, say, silence, tell, tell_notes
 from pipeline.errors import BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
 from pipeline.summary import summary
@@ -37,34 +36,6 @@ app = App(
 
 Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]
 Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults without it")]
-
-
-class Console:
-    """Shows a run's course on standard error, a line for whatever takes over two seconds."""
-
-    QUIET_S = 2.0
-
-    def __init__(self) -> None:
-        self._stage = ""
-        self._last_s = 0.0
-
-    def started(self, stage: str) -> None:
-        """A stage begins."""
-        self._stage = stage
-        self._last_s = time.monotonic()
-        print(f"{stage:9s} ...", file=sys.stderr, flush=True)
-
-    def progress(self, done: int, total: int) -> None:
-        """Say how far the stage is, at most every two seconds."""
-        now_s = time.monotonic()
-        if now_s - self._last_s >= self.QUIET_S:
-            self._last_s = now_s
-            print(f"{self._stage:9s} {done}/{total}", file=sys.stderr, flush=True)
-
-    def ended(self, stage: str, outcome: str, seconds: float) -> None:
-        """A stage ended."""
-        took = f" in {seconds:.1f} s" if seconds else ""
-        print(f"{stage:9s} {outcome}{took}", file=sys.stderr, flush=True)
 
 
 def _run(
@@ -186,6 +157,8 @@ def bake(
 def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None) -> int:
     """Run a folder of studies, each in a process of its own; print and write a table of all.
 
+    An interrupt begins no other study; the table then has what ended. Logs are in OUT/logs.
+
     Parameters
     ----------
     studies
@@ -193,7 +166,9 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     workers
         How many studies to run at a time.
     """
-    from pipeline.batch import NO_STUDY, Outcome, run_batch, table
+    from pipeline.batch import run_batch
+    from pipeline.batch_ending import INTERRUPTED_CODE
+    from pipeline.batch_table import NO_STUDY, table
     from pipeline.config import read_settings
 
     if workers < 1:
@@ -201,14 +176,17 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     # What is wrong with the settings is wrong for every study, and is said once.
     read_settings(config)
 
-    def ended(one: Outcome, done: int, total: int) -> None:
-        said = f"{done}/{total} {one.patient:24s} {one.status} in {one.seconds:.1f} s"
-        print(said, file=sys.stderr, flush=True)
-
-    outcomes = run_batch(studies, out, workers, config, ended)
-    print(table(outcomes))
+    ended = run_batch(studies, out, workers, config, BatchConsole())
+    print(table(ended.outcomes))
+    for note in ended.notes:
+        print(f"note      {note}")
+    print(f"products  {out}/<patient id>")
+    if ended.unwritten:
+        raise ended.unwritten
     print(f"table     {out / 'batch.csv'}")
-    return 0 if all(one.status in ("done", NO_STUDY) for one in outcomes) else 1
+    if ended.interrupted:
+        return INTERRUPTED_CODE
+    return 0 if all(one.status in ("done", NO_STUDY) for one in ended.outcomes) else 1
 
 
 @app.command
@@ -275,19 +253,31 @@ def _ask(
 
 
 @app.command
-def verify(field: Path, /, *, surfaces: Path | None = None) -> int:
-    """Check a baked field: manifest, sizes, checksums, metadata, finite values.
+def verify(fields: list[Path], /, *, surfaces: Path | None = None) -> int:
+    """Check baked fields: manifest, sizes, checksums, metadata, finite values.
 
     Parameters
     ----------
-    field
-        The field.zarr folder.
+    fields
+        The field.zarr folders; the exit code is that of the worst.
     surfaces
         Folder of the surfaces it was baked from: its accuracy is measured anew against them.
     """
+    if surfaces is not None and len(fields) > 1:
+        raise InputError(f"--surfaces {surfaces}: is of one field, and {len(fields)} are given")
+    worst = 0
+    for field in fields:
+        try:
+            _verify(field, surfaces)
+        except BeatfieldError as error:
+            worst = max(worst, tell(error))
+    return worst
+
+
+def _verify(field: Path, surfaces: Path | None) -> None:
     from pipeline.field.store import verify_field
 
-    print(f"{field}: {verify_field(field)}")
+    print(f"{field}: {verify_field(field)}", flush=True)
     if surfaces is not None:
         from pipeline.field.verify import certificate_rows
         from pipeline.own_surfaces import measure_field
@@ -295,7 +285,6 @@ def verify(field: Path, /, *, surfaces: Path | None = None) -> int:
         measured = measure_field(field, surfaces, Console().progress)
         for name, text in certificate_rows(measured):
             print(f"{name:36} {text}")
-    return 0
 
 
 @app.command
@@ -374,6 +363,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     # What is half-done is cleared away, as when a person interrupts.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Who starts it with `nohup` wants it to outlive the terminal.
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     return _guarded(lambda: app(arguments, exit_on_error=False, print_error=True))
 
 
@@ -384,17 +376,18 @@ def _guarded(command: Callable[[], Any]) -> int:
     except BrokenPipeError:
         # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell. What
         # was to be done may not be: the exit code is that of programs which this signal ends.
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        silence(sys.stdout, sys.stderr)
         return 128 + signal.SIGPIPE
     except CycloptsError:
         return 2
     except BeatfieldError as error:
-        print(f"error: {error}", file=sys.stderr)
-        for note in getattr(error, "__notes__", ()):
-            print(f"note: {note}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("interrupted; what is finished is kept", file=sys.stderr)
+        return tell(error)
+    except KeyboardInterrupt as interrupt:
+        say("interrupted; what is finished is kept")
+        tell_notes(interrupt)
         return 130
     return code if isinstance(code, int) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

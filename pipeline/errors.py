@@ -3,6 +3,9 @@
 A message says where, what came, what was needed and what to do.
 """
 
+NOT_TO_BE_USED = "do not use them for this one"
+"""Ends a note on products of another run; by these words a batch knows that it was told."""
+
 
 class BeatfieldError(Exception):
     """Any failure that the program can name; the command line turns it into an exit code."""

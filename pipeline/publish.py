@@ -33,11 +33,20 @@ LIBRARIES = (
     "SimpleITK",
     "opencv-contrib-python-headless",
     "pyvista",
+    "vtk",
     "numba",
+    "llvmlite",
     "zarr",
+    "nibabel",
+    "pydicom",
+    "wfdb",
+    "matplotlib",
+    "pillow",
+    "jinja2",
 )
+"""Those that read what goes into a product, or make it."""
 
-NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST}
 
 PACKAGE = Path(__file__).parent
@@ -50,8 +59,8 @@ def publishing(target: Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        When the disk is full or the place cannot be written. Nothing is left behind then, and
-        what stood at ``target`` before is untouched.
+        When the disk is full, a file too large or the place cannot be written. Nothing is left
+        behind then, and what stood at ``target`` before is untouched.
     """
     partial = target.with_name(f".{target.name}{PARTIAL}{os.getpid()}")
     with readable_write_errors(target):
@@ -76,6 +85,12 @@ def readable_write_errors(target: Path) -> Iterator[None]:
             raise InputError(
                 f"{target}: the disk is full ({error.strerror}); free some space or choose "
                 "another --out, then run again: finished stages are kept"
+            ) from error
+        if error.errno == errno.EFBIG:
+            raise InputError(
+                f"{target}: a file would be larger than `ulimit -f` or the file system allows "
+                f"({error.strerror}); raise the limit or choose another --out, then run again: "
+                "finished stages are kept"
             ) from error
         # Some file systems, such as /proc, say so of folders that they will not make.
         refused = Path(error.filename or "/")
@@ -133,6 +148,20 @@ def remove_partials(folder: Path) -> None:
 
 @contextmanager
 def only_run_in(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, and clear away what a killed run left in it.
+
+    Raises
+    ------
+    InputError
+        As `locked` does.
+    """
+    with locked(folder):
+        remove_partials(folder)
+        yield
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
     """Hold the folder's lock; the system lets go of it however the process ends.
 
     Raises
@@ -150,16 +179,27 @@ def only_run_in(folder: Path) -> Iterator[None]:
             raise InputError(
                 f"{folder}: another run is at work here; wait for it, or choose another --out"
             ) from error
-        remove_partials(folder)
         yield
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON whole or not at all."""
+    write_whole(path, json.dumps(content, indent=1) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When the disk is full or the place cannot be written; what stood there is untouched.
+    """
     partial = path.with_name(f".{path.name}{PARTIAL}{os.getpid()}")
     with readable_write_errors(path):
         try:
-            partial.write_text(json.dumps(content, indent=1) + "\n")
+            # File names may hold bytes that are no text.
+            partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pipeline.config import Settings
-from pipeline.errors import BeatfieldError, InputError
+from pipeline.errors import NOT_TO_BE_USED, BeatfieldError, InputError
 from pipeline.job import Job, Skipped
 from pipeline.memory import PeakMemory
 from pipeline.publish import (
@@ -124,12 +124,18 @@ def run_study(
         inputs = _input_digests(study)
         _require_same_study(study, inputs, products)
         run = _Run(study, settings, products, watcher, inputs, _earlier_stages(products))
-        for stage in wanted:
-            if stage.name == "register":
-                _require_ultrasound(run, stage, stage.name in forced)
-        for stage in wanted:
-            _bring_up_to_date(run, stage, force=stage.name in forced)
-        _note_standing_products(run, STAGES[len(wanted) :])
+        try:
+            # From here on it is told which products are old, however the run ends.
+            _record(run, "running")
+            for stage in wanted:
+                if stage.name == "register":
+                    _require_ultrasound(run, stage, stage.name in forced)
+            for stage in wanted:
+                _bring_up_to_date(run, stage, force=stage.name in forced)
+        except KeyboardInterrupt as interrupt:
+            stages = _record(run, "interrupted")["stages"]
+            _warn_of(run, [name for name in stages if stages[name]["status"] == "stale"], interrupt)
+            raise
         return _record(run, "done")
 
 
@@ -139,7 +145,7 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     standing = sealed(target)
     if standing and standing["fingerprint"] == key and not force:
         run.watcher.ended(stage.name, "unchanged", 0.0)
-        _note(run, stage.name, "done", standing["figures"], key, None)
+        run.stages[stage.name] = _entry(run, stage.name, "done", standing["figures"], key)
         return
     run.watcher.started(stage.name)
     clock, memory = time.perf_counter(), PeakMemory()
@@ -148,7 +154,7 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     except Skipped as reason:
         remove(target)
         run.watcher.ended(stage.name, f"skipped: {reason}", 0.0)
-        run.stages[stage.name] = {"status": "skipped", "cause": str(reason)}
+        run.stages[stage.name] = {"status": "skipped", "cause": str(reason), "fingerprint": key}
         return
     except BeatfieldError as error:
         _fail(run, stage, error, time.perf_counter() - clock)
@@ -156,12 +162,9 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         for word, text in remarks(run.stages):
             error.add_note(f"{word}: {text}")
         raise
-    except KeyboardInterrupt:
-        _record(run, "interrupted")
-        raise
     seconds = time.perf_counter() - clock
     measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}
-    _note(run, stage.name, "done", figures, key, measured)
+    run.stages[stage.name] = _entry(run, stage.name, "done", figures, key, measured)
     _record(run, "running")
     run.watcher.ended(stage.name, "done", seconds)
 
@@ -177,12 +180,8 @@ def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
     try:
         module.require_usable(run.study, run.settings.register_)
     except BeatfieldError as error:
-        _note_standing_products(run, STAGES[: STAGES.index(register)])
         run.watcher.started(register.name)
         _fail(run, register, error, time.perf_counter() - clock)
-        raise
-    except KeyboardInterrupt:
-        _record(run, "interrupted")
         raise
 
 
@@ -192,22 +191,46 @@ def _fail(run: _Run, stage: Stage, error: BeatfieldError, seconds: float) -> Non
     run.watcher.ended(stage.name, "failed", seconds)
     _record(run, "failed")
     later = STAGES[STAGES.index(stage) :]
-    if old := [one.name for one in later if (run.products / one.name).is_dir()]:
+    _warn_of(run, [one.name for one in later if (run.products / one.name).is_dir()], error)
+
+
+def _warn_of(run: _Run, old: list[str], error: BaseException) -> None:
+    """Say which products an earlier run left, of stages that this one did not come to."""
+    if old:
         error.add_note(
             f"{', '.join(old)} in {run.products} came of an earlier run with other input or "
-            "settings; do not use them for this one"
+            f"settings; {NOT_TO_BE_USED}"
         )
 
 
-def _note_standing_products(run: _Run, stages: tuple[Stage, ...]) -> None:
-    """Say of products of stages that were not asked for whether they still hold."""
-    for stage in stages:
-        standing = sealed(run.products / stage.name)
-        if standing is None:
-            continue
-        key = _fingerprint(run, stage)
-        current = standing["fingerprint"] == key
-        _note(run, stage.name, "done" if current else "stale", standing["figures"], key, None)
+def _all_stages(run: _Run) -> dict[str, dict[str, Any]]:
+    """What this run did, and what stands of the stages that it has not come to.
+
+    What was made from a product that no longer holds does not hold either.
+    """
+    stages: dict[str, dict[str, Any]] = {}
+    for stage in STAGES:
+        holds = all(stages.get(one, {}).get("status") in ("done", "skipped") for one in stage.after)
+        entry = run.stages.get(stage.name) or _standing(run, stage, holds)
+        if entry:
+            stages[stage.name] = entry
+    return stages
+
+
+def _standing(run: _Run, stage: Stage, holds: bool) -> dict[str, Any] | None:
+    """What an earlier run left of a stage: its product, done or stale, or why there is none.
+
+    ``holds`` says that nothing which it was made from is to be made anew.
+    """
+    key = _fingerprint(run, stage)
+    standing = sealed(run.products / stage.name)
+    if standing is None:
+        earlier = _earlier(run, stage.name)
+        skipped = earlier.get("status") == "skipped" and earlier.get("fingerprint") == key
+        return dict(earlier) if holds and skipped else None
+    made_from = standing["fingerprint"]
+    status = "done" if holds and made_from == key else "stale"
+    return _entry(run, stage.name, status, standing["figures"], made_from)
 
 
 def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
@@ -296,20 +319,25 @@ def _earlier_stages(products: Path) -> Mapping[str, Any]:
     return stages if isinstance(stages, dict) else {}
 
 
-def _note(
+def _earlier(run: _Run, name: str) -> Mapping[str, Any]:
+    entry = run.before.get(name)
+    return entry if isinstance(entry, dict) else {}
+
+
+def _entry(
     run: _Run,
     name: str,
     status: str,
     figures: Mapping[str, Any],
     key: str,
-    measured: Mapping[str, Any] | None,
-) -> None:
-    """Record a finished stage; one that was not run again keeps the timing of when it was."""
+    measured: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Describe a finished stage; one that was not run again keeps the timing of when it was."""
     if measured is None:
-        earlier = run.before.get(name, {})
+        earlier = _earlier(run, name)
         same = earlier.get("fingerprint") == key
         measured = {k: earlier.get(k) if same else None for k in ("seconds", "peak_memory_mb")}
-    run.stages[name] = {"status": status, "fingerprint": key, **measured, "figures": dict(figures)}
+    return {"status": status, "fingerprint": key, **measured, "figures": dict(figures)}
 
 
 def _record(run: _Run, status: str) -> dict[str, Any]:
@@ -326,7 +354,7 @@ def _record(run: _Run, status: str) -> dict[str, Any]:
         },
         "settings": run.settings.model_dump(mode="json", by_alias=True),
         "inputs": run.inputs,
-        "stages": run.stages,
+        "stages": _all_stages(run),
     }
     write_json(run.products / "run.json", content)
     return content

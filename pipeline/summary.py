@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,8 @@ def summary(record: dict[str, Any], products: Path) -> str:
     example = bake.get("figures", {}).get("example")
     if example and bake["status"] != "stale":
         point = " ".join(f"{value:g}" for value in example["point_mm"])
-        field = products / "bake" / "field.zarr"
+        # The line is there to be pasted, and names may hold spaces.
+        field = shlex.quote(str(products / "bake" / "field.zarr"))
         lines.append(
             f"query     beatfield query {field} --point {point} --phase {example['phase']}"
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
+from pipeline.errors import InputError, StageError
 from pipeline.summary import summary
 
 
@@ -178,6 +179,14 @@ def test_every_named_fixture_can_be_used(path: Path) -> None:
     assert read_settings(path).fixtures
 
 
+@pytest.mark.parametrize("module", ["pipeline", "pipeline.cli"])
+def test_the_module_is_the_program(module: str) -> None:
+    command = [sys.executable, "-m", module, "verify", "none.zarr"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "none.zarr" in done.stderr
+
+
 def test_help_loads_no_heavy_library() -> None:
     script = (
         "import sys; from pipeline.cli import main; main(['--help'])\n"
@@ -297,6 +306,39 @@ def test_an_interruption_says_what_is_kept(
     monkeypatch.setattr("pipeline.cli._run", interrupted)
     assert main(["run", str(tmp_path), "--out", str(tmp_path / "out")]) == 130
     assert "interrupted; what is finished is kept" in capsys.readouterr().err
+
+
+def test_a_bad_field_does_not_hide_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def verified(field: Path) -> str:
+        if field.name == "good":
+            return "whole"
+        raise (StageError if field.name == "late" else InputError)(f"{field.name}: cut short")
+
+    monkeypatch.setattr("pipeline.field.store.verify_field", verified)
+    assert main(["verify", "bad", "late", "good"]) == 2
+    printed, said = capsys.readouterr()
+    assert printed == "good: whole\n"
+    assert said == "error: bad: cut short\nerror: late: cut short\n"
+    assert main(["verify", "good", "late"]) == 1
+    assert main(["verify", "good", "good"]) == 0
+    assert main(["verify", "good", "good", "--surfaces", str(tmp_path)]) == 2
+    assert "is of one field" in capsys.readouterr().err
+    assert main(["verify"]) == 2
+
+
+def test_notes_beside_an_interrupt_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        interrupt = KeyboardInterrupt()
+        interrupt.add_note("bake is old")
+        raise interrupt
+
+    monkeypatch.setattr("pipeline.cli._run", interrupted)
+    assert main(["run", str(tmp_path), "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "note: bake is old"
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from pipeline.geometry import Float, MovingSurface
 from pipeline.report import curves, slices
 from pipeline.report.animation import beating_surfaces
 from pipeline.report.moments import Moments
 from pipeline.report.page import Picture, Section, Table, picture
 from pipeline.report.style import as_png, as_svg, as_webp
+from pipeline.surface.measures import mean_lv_mass_g
 
 MOST_DOUBTS = 12
 
@@ -104,5 +103,5 @@ def function_rows(measures: Mapping[str, Any]) -> list[tuple[str, str]]:
             (f"{short} volume, largest / smallest", f"{largest:.0f} / {smallest:.0f} ml"),
         )
         rows.append((f"{short} ejection fraction", f"{100 * (1 - smallest / largest):.0f} %"))
-    rows.append(("LV mass", f"{np.mean(measures['lv_mass_g']):.0f} g"))
+    rows.append(("LV mass", f"{mean_lv_mass_g(measures):.0f} g"))
     return rows

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.job import Job
 from pipeline.products import read_labels, read_table, write_surfaces, write_table
 from pipeline.surface.extraction import extract
-from pipeline.surface.measures import measures
+from pipeline.surface.measures import mean_lv_mass_g, measures
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def _headline(table: dict[str, Any]) -> dict[str, Any]:
         "volumes_ml": table["volumes_ml"],
         "lv_ejection_fraction": table["lv_ejection_fraction"],
         "rv_ejection_fraction": table["rv_ejection_fraction"],
-        "lv_mass_g": table["lv_mass_g"][diastole],
+        "lv_mass_g": round(mean_lv_mass_g(table), 1),
         "lv_wall_thickness_mm": {
             "end_diastole": thickness[diastole],
             "end_systole": thickness[systole],

@@ -9,7 +9,7 @@ stage writes as ``measures.json``::
      "volumes_ml": {structure: [...]},     # what each surface encloses, one value a phase
      "lv_ejection_fraction": 0.6,          # stroke volume over largest volume
      "rv_ejection_fraction": 0.55,         # null where there is no right ventricle
-     "lv_mass_g": [...],                   # left muscle, one value a phase
+     "lv_mass_g": [...],                   # left muscle, one value a phase; told is their mean
      "lv_wall_thickness_mm": {
          "mean": [...],                    # over the whole wall, one value a phase
          "segments": {name: [...]}}}       # the same by segment; only those with a wall to measure
@@ -93,6 +93,11 @@ def volumes_ml(moving: MovingSurface) -> Float:
 def ejection_fraction(volume_ml: Float) -> float:
     """Stroke volume over the largest volume, in [0, 1]."""
     return float(1 - volume_ml.min() / volume_ml.max())
+
+
+def mean_lv_mass_g(table: Mapping[str, Any]) -> float:
+    """Mass of the left muscle: the mean over the phases, for it does not change with them."""
+    return float(np.mean(table["lv_mass_g"]))
 
 
 def wall_thickness_mm(

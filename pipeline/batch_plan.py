@@ -1,0 +1,192 @@
+"""Which studies a batch runs: what cannot be run is known before the first one begins."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import InputError
+from pipeline.study import open_study, studies_in
+from pipeline.study_files import LITTER
+
+TABLE, LOGS = "batch.csv", "logs"
+"""What a batch itself writes beside the patients' folders."""
+
+MOST_NAMED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A folder among the studies, and what is to be done with it."""
+
+    name: str
+    folder: Path
+    """The study; of a folder that holds exactly one study, that one."""
+
+    patient_id: str = ""
+    """Empty where the study cannot be opened; its own run says why."""
+
+    refused: str = ""
+    """Why it is not run; empty where it is."""
+
+    is_study: bool = True
+
+
+def plan_batch(studies: Path, out: Path) -> list[Plan]:
+    """What is to be done with each folder in ``studies``, by name.
+
+    Folders that are no study are told too, but for hidden ones and where ``out`` lies.
+
+    Raises
+    ------
+    InputError
+        When ``studies`` is missing or holds no study, or products in ``out`` would lie in a study
+        or be taken for one.
+    """
+    if not studies.is_dir():
+        raise InputError(f"{studies}: no such folder; give the folder that holds the studies")
+    try:
+        direct = set(studies_in(studies))
+        folders = sorted(path for path in studies.iterdir() if path.is_dir())
+    except OSError as error:
+        raise InputError(_cannot_be_entered(error)) from error
+    here = out.resolve()
+    looked_at = [
+        one
+        for one in folders
+        if one in direct or not (one.name.startswith(".") or one.resolve() == here)
+    ]
+    plans = [_plan(one, one in direct) for one in looked_at]
+    plans = [one for one in plans if one.is_study or not here.is_relative_to(one.folder.resolve())]
+    if not any(one.is_study for one in plans):
+        raise InputError(f"{studies}: holds no study (folders with cine/ or study.yaml)")
+    _require_out_elsewhere(studies, out, plans)
+    return _without_clashes(plans)
+
+
+def _plan(path: Path, direct: bool) -> Plan:
+    try:
+        inside = [path] if direct else studies_in(path)
+    except OSError as error:
+        return Plan(path.name, path, refused=_cannot_be_entered(error))
+    if not inside:
+        return Plan(path.name, path, is_study=False)
+    folder = inside[0] if len(inside) == 1 else path
+    try:
+        return Plan(path.name, folder, open_study(folder).patient_id)
+    except InputError:
+        return Plan(path.name, folder)
+    except OSError as error:
+        return Plan(path.name, folder, refused=_cannot_be_entered(error))
+
+
+def _cannot_be_entered(error: OSError) -> str:
+    return (
+        f"{error.filename}: cannot be entered ({error.strerror}); give yourself the right to read "
+        "it, or take it out"
+    )
+
+
+def _require_out_elsewhere(studies: Path, out: Path, plans: Sequence[Plan]) -> None:
+    here = out.resolve()
+    if here == studies.resolve():
+        raise InputError(
+            f"{out}: holds the studies, and products would be taken for some; choose another --out"
+        )
+    for plan in plans:
+        if plan.is_study and here.is_relative_to(plan.folder.resolve()):
+            raise InputError(f"{out}: lies inside the study {plan.folder}; choose another --out")
+
+
+def _without_clashes(plans: Sequence[Plan]) -> list[Plan]:
+    """Refuse studies that would write into one folder, or where the batch itself writes.
+
+    Capitals do not tell folders apart everywhere.
+    """
+    checked = []
+    for plan in plans:
+        name = plan.patient_id.casefold()
+        same = [one for one in plans if name and one.patient_id.casefold() == name]
+        others = [str(one.folder) for one in same if one is not plan]
+        if others:
+            plan = replace(
+                plan,
+                refused=f"{plan.folder}: has the patient id {plan.patient_id!r} of "
+                f"{_named(others)}; give each study its own patient_id in study.yaml",
+            )
+        elif name in (TABLE, LOGS):
+            plan = replace(
+                plan,
+                refused=f"{plan.folder}: a batch writes {name} of its own beside the patients; "
+                f"give a patient_id other than {plan.patient_id!r} in study.yaml",
+            )
+        checked.append(plan)
+    return checked
+
+
+def notes_on(studies: Path, out: Path, plans: Sequence[Plan]) -> list[str]:
+    """What lies in either folder and belongs to no study of the batch, a sentence each."""
+    try:
+        beside = [path for path in sorted(studies.iterdir()) if not path.is_dir()]
+    except OSError:
+        # Gone while the studies ran; what they left is told all the same.
+        beside = []
+    loose = [one.name for one in beside if not one.is_symlink() and not _is_litter(one.name)]
+    dead = [one.name for one in beside if one.is_symlink() and not one.exists()]
+    known = {one.patient_id or one.name for one in plans if one.is_study}
+    known |= {products.name for one in plans if (products := products_of(out, one))}
+    others = [one.name for one in _patients(out) if one.name not in known]
+    told = (
+        (loose, f"{studies}: files beside the studies were not looked at"),
+        (dead, f"{studies}: links lead nowhere"),
+        (others, f"{out}: also holds products that are of no study of this batch"),
+    )
+    return [f"{what}: {_named(names)}" for names, what in told if names]
+
+
+def _is_litter(name: str) -> bool:
+    return name.startswith(".") or name.lower() in LITTER
+
+
+def _named(names: Sequence[str]) -> str:
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def products_of(out: Path, plan: Plan) -> Path | None:
+    """The patient's folder of products, if there is one.
+
+    Of a study that cannot be opened it is the one whose ``run.json`` names the study.
+    """
+    if plan.patient_id:
+        known = out / plan.patient_id
+        return known if known.is_dir() else None
+    return next((one for one in _patients(out) if _is_of(one, plan.folder)), None)
+
+
+def _patients(out: Path) -> Iterable[Path]:
+    return sorted(path.parent for path in out.glob("*/run.json"))
+
+
+def _is_of(products: Path, study: Path) -> bool:
+    return read_record(products).get("study") == str(study.resolve())
+
+
+def read_record(products: Path | None) -> dict[str, Any]:
+    """What ``run.json`` says; nothing where there is none that can be read."""
+    try:
+        content = json.loads(record_bytes(products))
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def record_bytes(products: Path | None) -> bytes:
+    """``run.json`` as it is; empty where there is none."""
+    try:
+        return (products / "run.json").read_bytes() if products else b""
+    except OSError:
+        return b""

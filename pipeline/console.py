@@ -1,0 +1,89 @@
+"""What the command line says on standard error while it works, and of what went wrong."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import TYPE_CHECKING, TextIO
+
+from pipeline.errors import BeatfieldError
+
+if TYPE_CHECKING:
+    # Only the command that runs a batch needs what that loads.
+    from pipeline.batch_table import Outcome
+
+
+class Console:
+    """Shows a run's course on standard error, a line for whatever takes over two seconds."""
+
+    QUIET_S = 2.0
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._last_s = 0.0
+
+    def started(self, stage: str) -> None:
+        """A stage begins."""
+        self._stage = stage
+        self._last_s = time.monotonic()
+        print(f"{stage:9s} ...", file=sys.stderr, flush=True)
+
+    def progress(self, done: int, total: int) -> None:
+        """Say how far the stage is, at most every two seconds."""
+        now_s = time.monotonic()
+        if now_s - self._last_s >= self.QUIET_S:
+            self._last_s = now_s
+            print(f"{self._stage:9s} {done}/{total}", file=sys.stderr, flush=True)
+
+    def ended(self, stage: str, outcome: str, seconds: float) -> None:
+        """A stage ended."""
+        took = f" in {seconds:.1f} s" if seconds else ""
+        print(f"{stage:9s} {outcome}{took}", file=sys.stderr, flush=True)
+
+
+class BatchConsole:
+    """Shows a batch's course on standard error, a line for each study that ended."""
+
+    def ended(self, outcome: Outcome, done: int, total: int) -> None:
+        """A study ended."""
+        say(f"{done}/{total} {outcome.patient:24s} {outcome.status} in {outcome.seconds:.1f} s")
+
+    def interrupted(self, running: int) -> None:
+        """No other study begins."""
+        say(f"interrupted; waiting for {running} to end, Ctrl-C again ends them at once")
+
+
+def say(text: str) -> None:
+    """Print on standard error; work does not end because nobody can be told of it."""
+    if sys.stderr is None:
+        # Closed by who called: Python would print on standard output in its place.
+        return
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except RuntimeError:
+        # A signal came while another line was printed.
+        return
+    except OSError:
+        silence(sys.stderr)
+
+
+def silence(*streams: TextIO) -> None:
+    """Let streams lead nowhere, so that Python can end without telling of them."""
+    for stream in streams:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+def tell(error: BeatfieldError) -> int:
+    """Say what went wrong and what to know beside it; return the exit code that this asks for."""
+    say(f"error: {error}")
+    tell_notes(error)
+    return error.exit_code
+
+
+def tell_notes(error: BaseException) -> None:
+    """Say what is to be known beside an error."""
+    for note in getattr(error, "__notes__", ()):
+        say(f"note: {note}")

@@ -1,0 +1,246 @@
+"""What lies in the folders of a batch: ids that clash, studies one level deeper, locks, leftovers.
+
+A program stands in for the pipeline's own process.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from batch_program import make_study, rows_of, stand_in
+
+from pipeline.batch_ending import how_it_ended
+from pipeline.cli import main
+from pipeline.publish import locked
+
+# Writes what a finished run writes; study.yaml's patient_id is read as the pipeline does.
+PROGRAM = """
+import json, os, pathlib, shutil, sys
+sys.path.insert(0, ROOT)
+study, out = pathlib.Path(sys.argv[4]), pathlib.Path(sys.argv[6])
+from pipeline.errors import InputError
+from pipeline.study import open_study
+try:
+    one = open_study(study)
+except InputError as error:
+    print(f"error: {error}", file=sys.stderr); sys.exit(2)
+products = out / one.patient_id
+products.mkdir(exist_ok=True)
+image = (one.cine.path / "image").read_text()
+inputs = {"cine": {"cine/image": image}} if image else {}
+record = {"study": str(one.folder), "stages": {}, "inputs": inputs}
+(products / "run.json").write_text(json.dumps(record))
+if study.name == "vanishes":
+    shutil.rmtree(study)
+if study.name == "blocks-the-table":
+    (out / "batch.csv").unlink(missing_ok=True); (out / "batch.csv").mkdir()
+"""
+
+
+@pytest.fixture
+def studies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    root = str(Path(__file__).parent.parent)
+    program = PROGRAM.replace("ROOT", repr(root))
+    monkeypatch.setattr("sys.executable", stand_in(tmp_path, program))
+    make_study(tmp_path / "studies" / "good")
+    return tmp_path / "studies"
+
+
+def batch(studies: Path, out: Path | None = None) -> int:
+    return main(["batch", str(studies), "--out", str(out or studies.parent / "out")])
+
+
+def test_a_row_says_where_the_study_and_its_products_are(studies: Path) -> None:
+    out = studies.parent / "out"
+    make_study(studies / "tenth", "patient_id: p10\n")
+    assert batch(studies) == 0
+    row = rows_of(out)["tenth"]
+    assert row["patient_id"] == "p10"
+    assert row["study"] == str(studies / "tenth")
+    assert row["products"] == str(out / "p10")
+
+
+@pytest.mark.parametrize("other", ["good", "Good"])
+def test_studies_of_one_patient_fail_and_the_others_are_run(studies: Path, other: str) -> None:
+    make_study(studies / "also", f"patient_id: {other}\n")
+    make_study(studies / "well")
+    assert batch(studies) == 1
+    rows = rows_of(studies.parent / "out")
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "also": "failed",
+        "good": "failed",
+        "well": "done",
+    }
+    assert f"has the patient id '{other}' of {studies / 'good'}" in rows["also"]["cause"]
+    assert f"of {studies / 'also'}; give each study" in rows["good"]["cause"]
+
+
+@pytest.mark.parametrize("name", ["logs", "batch.csv", "Logs"])
+def test_a_patient_is_not_called_what_the_batch_writes(studies: Path, name: str) -> None:
+    make_study(studies / "bad", f"patient_id: {name}\n")
+    assert batch(studies) == 1
+    rows = rows_of(studies.parent / "out")
+    assert (rows["good"]["status"], rows["bad"]["status"]) == ("done", "failed")
+    assert f"other than '{name}'" in rows["bad"]["cause"]
+
+
+def test_a_study_one_level_deeper_is_run_and_several_are_told(studies: Path) -> None:
+    make_study(studies / "one" / "inner")
+    for name in ("a", "b"):
+        make_study(studies / "two" / name)
+    assert batch(studies) == 1
+    rows = rows_of(studies.parent / "out")
+    assert (rows["one"]["status"], rows["one"]["patient_id"]) == ("done", "inner")
+    assert rows["one"]["study"] == str(studies / "one" / "inner")
+    assert rows["two"]["status"] == "failed"
+    assert "holds 2 studies (a, ...)" in rows["two"]["cause"]
+
+
+@pytest.mark.parametrize("place", [".", "good", "good/products"])
+def test_products_are_not_put_where_they_would_be_taken_for_studies(
+    studies: Path, place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(studies.rglob("*"))
+    assert batch(studies, studies / place) == 2
+    assert "choose another --out" in capsys.readouterr().err
+    assert sorted(studies.rglob("*")) == before
+
+
+def test_what_belongs_to_no_study_is_told(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = studies.parent / "out"
+    (out / "last-year").mkdir(parents=True)
+    (out / "last-year" / "run.json").write_text("{}")
+    (studies / "list.txt").touch()
+    (studies / ".hidden").touch()
+    (studies / "lost").symlink_to("nowhere")
+    assert batch(studies) == 0
+    notes = [one for one in capsys.readouterr().out.splitlines() if one.startswith("note ")]
+    assert notes[0].endswith("files beside the studies were not looked at: list.txt")
+    assert notes[1].endswith("links lead nowhere: lost")
+    assert notes[2].endswith("holds products that are of no study of this batch: last-year")
+
+
+def test_the_same_images_under_two_names_are_told(studies: Path) -> None:
+    for name, image in (("x", "same"), ("y", "same"), ("z", "other")):
+        make_study(studies / name, image=image)
+    assert batch(studies) == 0
+    told = {name: row["remarks"] for name, row in rows_of(studies.parent / "out").items()}
+    assert told == {"good": "", "x": "same images as y", "y": "same images as x", "z": ""}
+
+
+def test_two_batches_do_not_share_a_folder(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = studies.parent / "out"
+    (out / "logs").mkdir(parents=True)
+    (out / "logs" / "good.log").write_text("of the first")
+    with locked(out):
+        assert batch(studies) == 2
+    assert "another run is at work here" in capsys.readouterr().err
+    assert (out / "logs" / "good.log").read_text() == "of the first"
+    assert not (out / "batch.csv").exists()
+    assert batch(studies) == 0
+
+
+def test_a_study_that_vanishes_while_it_runs_costs_nothing(studies: Path) -> None:
+    make_study(studies / "vanishes")
+    assert batch(studies) == 0
+    assert rows_of(studies.parent / "out")["vanishes"]["status"] == "done"
+
+
+def test_a_name_that_leaves_no_room_for_an_ending(studies: Path) -> None:
+    name = "n" * 255
+    make_study(studies / name, "patient_id: short\n")
+    assert batch(studies) == 0
+    assert rows_of(studies.parent / "out")[name]["status"] == "done"
+
+
+def test_a_table_that_cannot_be_written_is_printed_all_the_same(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_study(studies / "blocks-the-table")
+    assert batch(studies) == 2
+    printed, said = capsys.readouterr()
+    assert "good" in printed
+    assert "batch.csv: cannot be written" in said
+    assert not list((studies.parent / "out").glob(".batch.csv*"))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is full")
+@pytest.mark.parametrize("stream", ["2>/dev/full", "2>&-"])
+def test_progress_that_cannot_be_told_costs_no_study(studies: Path, stream: str) -> None:
+    script = (
+        "import sys; from pipeline.cli import main\n"
+        "sys.executable = sys.argv[1]; sys.exit(main(['batch', *sys.argv[2:]]))"
+    )
+    python, out = sys.executable, str(studies.parent / "out")
+    real = json.loads(
+        subprocess.check_output(["sed", "-n", 's/^exec \\("[^"]*"\\).*/\\1/p', python], text=True)
+    )
+    command = [real, "-c", script, python, str(studies), "--out", out]
+    shell = f'exec "$@" {stream}'
+    done = subprocess.run(
+        ["sh", "-c", shell, "sh", *command], stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert rows_of(studies.parent / "out")["good"]["status"] == "done"
+    assert "good" in done.stdout
+    # Progress is not printed among the results in place of where it cannot be.
+    assert "1/1" not in done.stdout
+
+
+def test_a_study_that_cannot_be_opened_leaves_products_that_are_told(studies: Path) -> None:
+    out = studies.parent / "out"
+    assert batch(studies) == 0
+    (out / "good" / "bake").mkdir()
+    (out / "good" / "bake" / "stage.json").write_text("{}")
+    (studies / "good" / "study.yaml").write_text("nonsense: 1\n")
+    assert batch(studies) == 1
+    row = rows_of(out)["good"]
+    assert "nonsense" in row["cause"]
+    assert f"{out / 'good'} holds products of another run; do not use them" in row["cause"]
+    assert row["products"] == str(out / "good")
+
+
+@pytest.mark.parametrize(
+    ("code", "log", "status", "cause"),
+    [
+        (
+            2,
+            "error: a: wrong\nb: wrong\nnote: c\n  d\n\nleft",
+            "failed",
+            "a: wrong; b: wrong; c; d",
+        ),
+        (1, "Traceback\nMemoryError\n", "crashed", "MemoryError; memory may be short"),
+        (1, "Traceback\nKeyError: 3\n", "crashed", "KeyError: 3; see"),
+        (-signal.SIGKILL, "", "crashed", "SIGKILL; memory may be short: use fewer --workers"),
+        (-signal.SIGSEGV, "", "crashed", "SIGSEGV; see"),
+        (-40, "", "crashed", "signal 40; see"),
+        (130, "interrupted\nnote: e\n", "interrupted", "what was finished is kept; e"),
+        (-signal.SIGTERM, "", "interrupted", "what was finished is kept"),
+    ],
+)
+def test_a_cause_is_all_that_the_program_said(
+    tmp_path: Path, code: int, log: str, status: str, cause: str
+) -> None:
+    path = tmp_path / "log"
+    path.write_text(log)
+    found = how_it_ended(code, path, told_to_end=False)
+    assert found[0] == status
+    assert found[1].startswith(cause)
+    assert "left" not in found[1]
+
+
+def test_a_library_that_takes_an_interrupt_for_an_error_was_interrupted(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_text("RuntimeError: no compiled object yet\n")
+    assert how_it_ended(1, path, told_to_end=True)[0] == "interrupted"
+    path.write_text("error: no heart\n")
+    assert how_it_ended(1, path, told_to_end=True) == ("failed", "no heart")

@@ -1,0 +1,105 @@
+"""What `run.json` says of products that a run has not come to: done, stale or skipped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from kitchen import Kitchen
+
+from pipeline.config import Settings
+from pipeline.errors import StageError
+from pipeline.job import Job, Skipped
+
+CHANGED = Settings.model_validate({"bake": {"spacing_mm": 3.0}})
+"""Settings that only the second stage reads."""
+
+
+@pytest.fixture
+def kitchen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kitchen:
+    return Kitchen(tmp_path, monkeypatch)
+
+
+def statuses(kitchen: Kitchen) -> dict[str, str]:
+    return {name: stage["status"] for name, stage in kitchen.record()["stages"].items()}
+
+
+def stopped(job: Job) -> dict[str, Any]:
+    raise KeyboardInterrupt
+
+
+def test_what_is_made_from_a_stale_product_is_stale(kitchen: Kitchen) -> None:
+    """The third stage reads b as it was: only when b is made anew is it known to hold."""
+    kitchen.run()
+    kitchen.run(CHANGED, last="a")
+    assert statuses(kitchen) == {"a": "done", "b": "stale", "c": "stale"}
+    # Nothing was touched, so that the settings of before find all in place, with its timing.
+    kitchen.run(last="a")
+    assert statuses(kitchen) == dict.fromkeys("abc", "done")
+    assert kitchen.record()["stages"]["c"]["seconds"] is not None
+
+
+def test_an_interrupted_run_tells_of_older_products(kitchen: Kitchen) -> None:
+    kitchen.run()
+    kitchen.bodies["b"] = stopped
+    with pytest.raises(KeyboardInterrupt) as caught:
+        kitchen.run(CHANGED)
+    assert kitchen.record()["status"] == "interrupted"
+    assert statuses(kitchen) == {"a": "done", "b": "stale", "c": "stale"}
+    [note] = caught.value.__notes__
+    assert note.startswith(f"b, c in {kitchen.out / 'p1'} came of an earlier run")
+
+
+def test_products_that_hold_are_not_called_old_by_an_interrupt(kitchen: Kitchen) -> None:
+    kitchen.run()
+    kitchen.bodies["b"] = stopped
+    with pytest.raises(KeyboardInterrupt) as caught:
+        kitchen.run(first="b")
+    assert statuses(kitchen) == dict.fromkeys("abc", "done")
+    assert not hasattr(caught.value, "__notes__")
+
+
+def test_a_failure_keeps_later_stages_in_the_record(kitchen: Kitchen) -> None:
+    def fail(job: Job) -> dict[str, Any]:
+        raise StageError("no heart")
+
+    kitchen.run()
+    kitchen.bodies["b"] = fail
+    with pytest.raises(StageError):
+        kitchen.run(CHANGED)
+    assert statuses(kitchen) == {"a": "done", "b": "failed", "c": "stale"}
+
+
+def test_a_killed_run_has_said_which_products_are_old(kitchen: Kitchen) -> None:
+    """A process that is killed says nothing: what it recorded before must do."""
+    kitchen.run()
+    seen = []
+
+    def killed(job: Job) -> dict[str, Any]:
+        seen.append(json.loads((job.products / "run.json").read_text()))
+        raise KeyboardInterrupt
+
+    kitchen.bodies["b"] = killed
+    with pytest.raises(KeyboardInterrupt):
+        kitchen.run(CHANGED)
+    [record] = seen
+    assert record["status"] == "running"
+    assert [stage["status"] for stage in record["stages"].values()] == ["done", "stale", "stale"]
+
+
+def test_a_skipped_stage_is_not_forgotten_while_it_would_be_skipped_again(
+    kitchen: Kitchen,
+) -> None:
+    def skip(job: Job) -> dict[str, Any]:
+        raise Skipped("no ultrasound")
+
+    kitchen.bodies["b"] = skip
+    kitchen.bodies["c"] = lambda job: {}
+    kitchen.run()
+    kitchen.run(last="a")
+    assert statuses(kitchen) == {"a": "done", "b": "skipped", "c": "done"}
+    # With other settings it may have something to do, and c would then be made from that.
+    kitchen.run(CHANGED, last="a")
+    assert statuses(kitchen) == {"a": "done", "c": "stale"}
