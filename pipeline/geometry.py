@@ -20,8 +20,8 @@ Integer = npt.NDArray[np.int64]
 Label = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
-# How far the products of a rotation's axes may be from 0 and 1.
-_RIGID = 1e-3
+# How far the products of a rotation's axes may be from 0 and 1, and the last row from 0 0 0 1.
+_RIGID, _LAST_ROW = 1e-3, 1e-6
 
 
 def transform_points(target_from_source: Float, points: Float) -> Float:
@@ -40,15 +40,16 @@ def require_rigid(transform: Float, where: str) -> None:
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         raise InputError(f"{where}: needs a finite 4x4 matrix, got\n{transform}")
     rotation = transform[:3, :3]
-    proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID)
-    if not proper or np.linalg.det(rotation) < 0 or not np.allclose(transform[3], (0, 0, 0, 1)):
+    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    last = float(np.abs(transform[3] - (0, 0, 0, 1)).sum())
+    proper = off <= _RIGID
+    if not proper or np.linalg.det(rotation) < 0 or last > _LAST_ROW:
         hint = (
             "; it looks transposed: its shift stands in the last row, and belongs in the last "
             "column, above the 1"
             if proper and transform[3, :3].any() and not transform[:3, 3].any()
             else ""
         )
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         raise InputError(
             f"{where}: is not a rotation and a shift (its axes miss length 1 and right angles by "
             f"{off:.2g}, {_RIGID:g} is allowed), got\n{transform}{hint}"

@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -127,16 +127,18 @@ def _remove_orphans(target: Path) -> None:
     for path in target.parent.iterdir():
         pid = path.name.removeprefix(start)
         if path.name.startswith(start) and pid.isdecimal() and not _lives(int(pid)):
-            remove(path)
+            # What is another user's is theirs to clear away.
+            with suppress(OSError):
+                remove(path)
 
 
 def _lives(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 

@@ -11,7 +11,7 @@ int main(void)
     if (fread(head, sizeof head, 1, stdin) != 1)
         return 1;
     clock = bf_new_clock(head[0], head[1]);
-    clock.latency_s = head[2];
+    if (head[2] != 0.14) clock.latency_s = head[2]; /* which it is without being told */
     while (fread(row, sizeof row, 1, stdin) == 1) {
         double out[6] = {0, 0, 0, 0, 0, 0};
         if (row[0] == 0.0) {

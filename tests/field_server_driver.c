@@ -90,6 +90,14 @@ int main(int count, char **words)
         needle.points_mm = line;
         while (scanf("%lf", &line[5]) == 1)
             printf("%d\n", bf_tool_force(&field, 0, &needle, pose, 0, 0.05, out, torque, NULL));
+    } else if (!strcmp(command, "often")) {
+        int n;
+        for (n = 0; n < 200 && status == BF_OK; n++) {
+            bf_close(&field);
+            status = n % 2 ? bf_verify(words[1]) : BF_OK;
+            if (status == BF_OK) status = bf_open(&field, words[1]);
+        }
+        printf("%s\n", bf_text(status));
     } else printf("opened\n");
     bf_close(&field);
     return 0;

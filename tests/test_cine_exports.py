@@ -331,7 +331,9 @@ def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
     for name in ("readme.txt", "viewer.exe", "EMPTY"):
         (tmp_path / name).write_bytes(b"x" * (name != "EMPTY"))
     (tmp_path / "ANNOTATED.seq.NRRD").touch()
-    with pytest.raises(InputError, match=r"NRRD and 3 more.*neither DICOM nor NIfTI.*4D \.nii\.gz"):
+    with pytest.raises(
+        InputError, match=r"NRRD: is an image, but neither DICOM nor NIfTI.*4D \.nii\.gz"
+    ):
         read_dicom_cine(tmp_path)
     (tmp_path / "ANNOTATED.seq.NRRD").unlink()
     with pytest.raises(InputError, match=r"EMPTY and 2 more \(readme.txt, viewer.exe\): is not"):

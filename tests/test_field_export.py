@@ -207,7 +207,7 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
         (broken, "nrrd", new, "bytes"),
         (broken, "mhd", new, "bytes"),
         (path, "mhd", str(path / "inside"), "lies inside the field"),
-        (tmp_path / "50%.zarr", "mhd", new, "take a % in the name"),
+        (tmp_path / "50%.zarr", "mhd", new, "take a % in the path"),
     ]:
         assert main(["export", str(field), "--to", form, "--out", out]) == 2
         assert words in capsys.readouterr().err

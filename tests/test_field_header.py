@@ -162,7 +162,7 @@ def test_a_pose_that_is_none_is_refused_as_in_python(path, watched):
     turn[:3] = np.column_stack([Rotation.from_rotvec((0.3, -1, 2)).as_matrix(), (5, -6, 7)])
     stretched = [np.diag([1 + off, 1, 1, 1]) for off in (1, 6e-4, 4e-4, -4e-4, -6e-4)]
     sheared, last = np.eye(4) + np.eye(4, k=1) * 0.9e-3, turn.copy()
-    sheared[2, 3], last[3, 3] = 0, 1 + 1e-6
+    sheared[2, 3], last[3, 3] = 0, 1 + 2e-6
     mirror, skew = np.diag([1.0, 1, -1, 1]), np.eye(4) + 2e-3 * np.diag([1, 0, 0], k=1)
     poses = [turn, turn.T, mirror, 0 * turn, skew, sheared, last, *stretched]
     field, tool = ForceField.open(path), Needle(shape="needle", length_mm=9)

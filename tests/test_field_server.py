@@ -1,4 +1,4 @@
-"""What a force server meets beside good questions: spoilt files, no tracker, tools in metres."""
+"""What a force server meets beside good questions: spoilt files, no tracker, endless tools."""
 
 import json
 import os
@@ -51,6 +51,11 @@ def described(path, target, **changes):
     return target
 
 
+def test_opening_and_verifying_often_leaves_no_file_open(path, program):
+    limited = run("/bin/sh", "-c", f"ulimit -n 40; exec {program} {path} often")
+    assert limited.stdout == b"done\n"
+
+
 def test_gradients_may_be_left_out(path, program):
     assert run(program, path, "gradients").stdout == b"1\n"
 
@@ -63,6 +68,25 @@ def test_a_tank_of_nonsense_holds_nothing_and_no_number_passes_it(path, program)
     assert tank.passed((0, 0, 0), (float("inf"), 0, 0)) == (0, 0, 0)
     assert tank.level_mj == 1
     assert tank.passed((1, 0, 0), (2, 0, 0)) == (1, 0, 0)
+
+
+def test_a_tracker_that_comes_and_goes_drains_no_more_than_the_tank_held():
+    """Every second place is unknown, and the force pushes the hand on all the while."""
+    tank, given_mj = EnergyTank(1.0, 20.0), 0.0
+    for tick in range(2000):
+        place = float("nan") if tick % 2 else 0.1 * tick
+        held = tank.passed((place, 0, 0), (2, 0, 0))[0]
+        given_mj += 0.1 * held
+    # One step that could not be foreseen, and the first, before any way was seen.
+    assert given_mj <= 1.0 + 2 * 2 * 0.2 + 1e-9
+    # What the hand gave meanwhile fills nothing.
+    level_mj = tank.level_mj
+    tank.passed((0, 0, 0), (2, 0, 0))
+    tank.passed((float("nan"), 0, 0), (2, 0, 0))
+    before_mj = tank.level_mj
+    tank.passed((-50, 0, 0), (2, 0, 0))
+    assert tank.level_mj <= before_mj
+    assert level_mj <= 1.0
 
 
 @pytest.mark.parametrize("spoil", ["cut", "overwritten"])
@@ -97,10 +121,12 @@ def test_points_and_forces_go_between_tracker_and_mr(path, program, tmp_path):
 def test_without_a_registration_no_trackers_point_gets_a_force(path, program, tmp_path):
     store = described(path, tmp_path / "f.zarr", mr_from_tracker=None)
     not_finite = 8
-    assert run(program, store, "tracker").stdout.splitlines()[0] == b"0 %d" % not_finite
+    # And what is turned back to a device is no force, not no number.
+    said = run(program, store, "tracker").stdout.splitlines()
+    assert said == [b"0 %d" % not_finite, b"0 0 0"]
 
 
-def test_a_tool_in_another_unit_is_refused_at_once(path, program):
+def test_a_tool_too_long_for_the_grid_is_refused_at_once(path, program):
     field = ForceField.open(path)
     longest_mm = 20 * float(np.linalg.norm(field.grid.upper_mm - field.grid.origin_mm))
     lengths = (0.99 * longest_mm, 1.01 * longest_mm, 1e12, 1e150)
@@ -121,6 +147,11 @@ def test_a_tool_in_another_unit_is_refused_at_once(path, program):
         {"unit": "m"},
         {"periodic": False},
         {"rr_s": -3.0},
+        {"rr_s": 0.0},
+        {"fixtures__guide__m": 100},
+        {"fixtures__guide__device_limits__force_n": 0.0},
+        {"mr_from_tracker": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1 + 2e-6]]},
+        {"mr_from_tracker": [[1.001, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
         {"mr_from_tracker": np.diag([1e3, 1e3, 1e3, 1]).tolist()},
         {"mr_from_tracker": np.diag([-1.0, 1, 1, 1]).tolist()},
         {"mr_from_tracker": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [9, 9, 9, 9]]},
@@ -148,6 +179,19 @@ def replaced(path, other, at):
         (at / "new.zarr").rename(at / "live.zarr")
 
     return at / "live.zarr", swap
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1 + 5e-7]],
+        [[1.0004, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    ],
+)
+def test_c_and_python_take_the_same_roundings(path, program, tmp_path, pose):
+    store = described(path, tmp_path / "f.zarr", mr_from_tracker=pose)
+    assert run(program, store).stdout == b"opened\n"
+    np.testing.assert_array_equal(ForceField.open(store).mr_from_tracker, pose)
 
 
 def test_a_store_that_is_replaced_meanwhile_is_not_mixed_with_the_other(

@@ -1,5 +1,6 @@
 """Tools of any shape: read, divided, and felt like a plain sum over their points."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField, get_include
+from pipeline.field.manifest import write_manifest
 from pipeline.field.tool import Needle, Polyline, read_tool, spread_points
 
 ROOT = Path(__file__).parent.parent
@@ -176,15 +178,15 @@ def page_code(word):
 
 @pytest.mark.parametrize("language", ["c", "c++"])
 def test_the_pages_lines_of_c_are_a_program(folder, field, tmp_path, language):
-    """Its loop, then its needle: a point's force in the grid, none beyond it, and Python's tool."""
+    """Its loop, then its needle: a point's force in the tracker's frame, and Python's tool."""
     if shutil.which("gcc") is None or (language == "c++" and shutil.which("g++") is None):
         pytest.skip(f"needs a compiler of {language}")
     head, body = page_code("bf_open").split("bf_field field;")
     body, end = body.replace("epicardium_guidance", "guide").split("bf_close(")
     (tmp_path / "page.c").write_text(
         f"{head}\nint main(int count, char **words)\n{{\n"
-        "double phase = 0.37, point_mm[3] = {0, -3.5, 16.25};\n"
-        "if (count > 1) point_mm[0] = atof(words[1]);\n"
+        "double phase = 0.37, tip_mm[3];\n"
+        "for (int n = 0; n < 3 && n + 1 < count; n++) tip_mm[n] = atof(words[n + 1]);\n"
         f"bf_field field;{body}\nfwrite(force_n, sizeof(double), 3, stdout);\n"
         f"{page_code('bf_tool_force')}\nfwrite(force_n, sizeof(double), 3, stdout);\n"
         f"fwrite(torque_nmm, sizeof(double), 3, stdout);\nbf_close({end}\n"
@@ -195,15 +197,25 @@ def test_the_pages_lines_of_c_are_a_program(folder, field, tmp_path, language):
     subprocess.run(command, cwd=tmp_path, check=True)
     place = tmp_path / "OUT/patient-0001/bake"
     place.mkdir(parents=True)
-    (place / "field.zarr").symlink_to(folder)
+    shutil.copytree(folder, place / "field.zarr")
+    mr_from_tracker = np.eye(4)
+    mr_from_tracker[:3, :3] = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    mr_from_tracker[:3, 3] = (200.0, -90.0, 35.0)
+    about = json.loads((place / "field.zarr/zarr.json").read_text())
+    about["attributes"]["beatfield"]["mr_from_tracker"] = mr_from_tracker.tolist()
+    (place / "field.zarr/zarr.json").write_text(json.dumps(about))
+    (place / "field.zarr/manifest.json").unlink()
+    write_manifest(place / "field.zarr")
     needle = Needle(shape="needle", length_mm=150, handle_mm=(0, 0, 150))
     for x_mm in (4.0, 500.0):
-        done = subprocess.run(["./page", str(x_mm)], cwd=tmp_path, capture_output=True, check=True)
+        point_mm, pose = np.array([x_mm, -3.5, 16.25]), np.eye(4)
+        tip_mm = (np.linalg.inv(mr_from_tracker) @ [*point_mm, 1])[:3]
+        words = ["./page", *map(repr, tip_mm.tolist())]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, check=True)
         found = np.frombuffer(done.stdout)
-        tip_mm, pose = (x_mm, -3.5, 16.25), np.eye(4)
-        pose[:3, 3] = tip_mm
+        pose[:3, 3] = point_mm
         felt = field.tool_force(needle, pose, 0.37, "guide")
-        point_n = field.force_at(*tip_mm, 0.37, "guide") if x_mm < 100 else (0, 0, 0)
+        point_n = field.force_at(*point_mm, 0.37, "guide") @ mr_from_tracker[:3, :3]
         np.testing.assert_allclose(found[:3], point_n, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found[3:6], felt.force_n, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found[6:], felt.torque_nmm, rtol=0, atol=1e-6)

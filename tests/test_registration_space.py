@@ -245,7 +245,9 @@ class TestRefusals:
         near = np.tile(np.eye(4), (14, 1, 1))
         near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
         poses = recording.sweeps[0].tracker_from_image
-        sweeps = [SimpleNamespace(tracker_from_image=poses, tracker_from_probe=near)]
+        sweeps = [
+            SimpleNamespace(tracker_from_image=poses, tracker_from_probe=near, pose_frame="Tracker")
+        ]
         stop = type(wrong) is InputError or on_failure == "stop"
         with pytest.raises(type(wrong) if stop else Skipped, match=f"{wrong}; .*in metres"):
             stage._registered(job, sweeps, timing, {}, None)
@@ -256,7 +258,7 @@ class TestRefusals:
 
     def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
         sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))
-        monkeypatch.setattr(stage, "read_sweep", lambda _: sweep)
+        monkeypatch.setattr(stage, "read_sweeps", lambda _: [sweep])
         monkeypatch.setattr(stage, "_r_times_s", lambda _: None)
         timing = SimpleNamespace(phases=lambda: [np.zeros(4)])
         monkeypatch.setattr(stage, "_timing", lambda *_: timing)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
 from sweep_files import FRAMES, calibration, good_fields, rigid, text, write
 
 from pipeline.errors import InputError
 from pipeline.imaging.ultrasound import read_sweep, read_sweeps, remarks_on
 from pipeline.products import write_slicer_transform
+from pipeline.run import STAGES, _described
+from pipeline.stages import register
 from pipeline.study import UltrasoundFiles
+from pipeline.summary import remarks
 
 STEP_MM = 4.0
 PROBE_TO_REFERENCE = "ProbeToReferenceTransform"
@@ -20,6 +26,7 @@ def reference(k):
     """The patient's marker: far from the probe, and it drifts and turns a little."""
     pose = rigid(5)
     pose[:3, 3] += [STEP_MM * k, 0, 100]
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, 0.02 * k]).as_matrix()
     return pose
 
 
@@ -68,9 +75,51 @@ def test_a_reference_that_moves_needs_a_choice(tmp_path, told_by_probe):
         for k in range(FRAMES):
             fields[f"Seq_Frame{k:04d}_{PROBE_TO_REFERENCE}"] = text(followed(k))
     path = write(tmp_path / "s.mha", fields)
-    # Five places 4 mm apart: the root mean square about their middle is the square root of 2 steps.
-    with pytest.raises(InputError, match=r"Reference moves .* by 5\.7 mm .* us\.pose_frame"):
+    with pytest.raises(InputError, match=r"Reference moves .* us\.pose_frame"):
         read_sweeps(files(path))
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_what_a_reference_moves_by_is_told_of_the_probe_and_noise_is_none(tmp_path, still):
+    """About the probe's own place nothing moves, whatever the marker does far from it."""
+    fields = with_reference()
+    middle = np.mean([rigid(k)[:3, 3] for k in range(FRAMES)], axis=0)
+    for k in range(FRAMES):
+        motion, about = np.eye(4), np.eye(4)
+        motion[:3, :3] = Rotation.from_rotvec([0, 0.01 * k, 0]).as_matrix()
+        motion[0, 3] = 0.0 if still else 1.0 * k
+        about[:3, 3] = middle
+        pose = about @ motion @ np.linalg.inv(about) @ reference(0)
+        fields[f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"] = text(pose)
+    path = write(tmp_path / "s.mha", fields)
+    if still:
+        read_sweeps(files(path))
+    else:
+        # Of 2, 1, 0, 1 and 2 mm from the middle the root mean square is the root of 2.
+        with pytest.raises(InputError, match=r"by 1\.4 mm at the probe"):
+            read_sweeps(files(path))
+    # Poses that follow it are asked nothing.
+    read_sweeps(files(path, pose_frame="Reference"))
+
+
+def test_a_pose_now_and_then_is_no_motion(tmp_path):
+    fields, many = {}, 40
+    pixels = np.zeros((many, 12, 17), np.uint8)
+    for k in range(many):
+        start = f"Seq_Frame{k:04d}_"
+        place = reference(0)
+        place[0, 3] += 9.0 * (k == 7)
+        fields[start + "Timestamp"] = f"{0.1 * k}"
+        fields[start + "ProbeToTrackerTransform"] = text(rigid(k))
+        fields[start + "ReferenceToTrackerTransform"] = text(place)
+        fields[start + "ImageToProbeTransform"] = text(calibration())
+    read_sweeps(files(write(tmp_path / "s.mha", fields, pixels)))
+
+
+def test_a_frame_that_moves_with_the_probe_is_none_for_poses(tmp_path):
+    path = write(tmp_path / "s.mha", with_reference())
+    with pytest.raises(InputError, match="Probe moves with the probe"):
+        read_sweeps(files(path, pose_frame="Probe"))
 
 
 def test_a_reference_that_moves_between_sweeps_needs_a_choice(tmp_path):
@@ -140,10 +189,42 @@ def test_a_calibration_of_the_study_stands_in_for_the_files(tmp_path):
 
 
 def test_a_pose_of_zeros_is_none(tmp_path):
-    fields = good_fields() | {"Seq_Frame0004_ProbeToTrackerTransform": text(np.zeros((4, 4)))}
+    blank = np.diag([0.0, 0, 0, 1])
+    fields = good_fields() | {"Seq_Frame0004_ProbeToTrackerTransform": text(blank)}
     (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
     np.testing.assert_array_equal(sweep.numbers, np.arange(4))
     assert remarks_on([sweep]) == [f"s: {sweep.remarks[0]}"]
+
+
+def test_rows_of_frames_are_numbered_as_in_the_file(tmp_path):
+    fields = good_fields() | {"Seq_Frame0001_ImageStatus": "INVALID"}
+    sweeps = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    found = SimpleNamespace(residual=np.zeros(4), valid=np.ones(4, bool))
+    rows = register._rows(sweeps, [np.linspace(0, 0.9, 4)], found)
+    assert [row.frame for row in rows] == [0, 2, 3, 4]
+    assert [row.time_s for row in rows] == pytest.approx([3.0, 3.1, 3.15, 3.2])
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        {"pose_frame": "Reference"},
+        {"probe_from_image": np.eye(4).tolist()},
+        {"initial_mr_from_tracker": np.eye(4).tolist()},
+    ],
+)
+def test_what_the_study_says_of_poses_makes_a_registration_anew(tmp_path, key):
+    (stage,) = [one for one in STAGES if one.name == "register"]
+    said = [
+        _described(SimpleNamespace(us=files(tmp_path / "s.mha", **keys)), stage)
+        for keys in ({}, key)
+    ]
+    assert said[0] != said[1]
+
+
+def test_what_is_to_be_known_of_sweeps_is_told_at_the_end(tmp_path):
+    told = remarks({"register": {"status": "done", "figures": {"remarks": ["one", "two"]}}})
+    assert told == [("input", "one"), ("input", "two")]
 
 
 def test_the_transform_for_slicer_puts_tracker_points_beside_the_mr(tmp_path):

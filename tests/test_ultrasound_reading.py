@@ -276,6 +276,17 @@ def test_frames_that_are_not_2d_are_refused(tmp_path, shape):
         read_sweep(write(tmp_path / "s.mha", good_fields(), np.zeros(shape, np.uint8)))
 
 
+def test_frames_one_pixel_thick_are_frames(tmp_path):
+    path = write(tmp_path / "s.mha", good_fields(), PIXELS[:, None])
+    np.testing.assert_array_equal(read_sweep(path).images, PIXELS)
+
+
+def test_an_unknown_orientation_is_told(tmp_path):
+    fields = good_fields() | {"UltrasoundImageOrientation": "XX"}
+    (remark,) = read_sweep(write(tmp_path / "s.mha", fields)).remarks
+    assert "orientation" in remark.lower()
+
+
 def test_colour_frames_are_refused(tmp_path):
     colour = np.repeat(PIXELS[..., None], 3, axis=-1)
     grey = write(tmp_path / "grey.mha", good_fields(), colour, vector=True)

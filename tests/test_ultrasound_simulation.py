@@ -288,7 +288,7 @@ def test_frames_that_the_tracker_missed_are_written_as_invalid_and_left_out_by_t
         assert status == ("INVALID" if k in missed else "OK")
         assert image.GetMetaData(f"Seq_Frame{k:04d}_ImageStatus") == "OK"
     read = read_sweep(tmp_path / "s.mha")
-    assert read.dropped == 3
+    assert read.remarks[0].startswith("3 of 12 frames left out")
     np.testing.assert_array_equal(read.times_s, sweep.times_s[~sweep.untracked])
 
 

@@ -50,10 +50,6 @@ def export_field(path: Path, form: str, out: Path) -> Path:
         raise InputError(
             f"--out {out}: lies inside the field, which it would spoil; choose another"
         )
-    if form == "mhd" and "%" in str(path.resolve()):
-        raise InputError(
-            f"{path}: MetaImage headers take a % in the name of a file for a number; rename it"
-        )
     require_manifest(path)
     field = _Stored(path.resolve(), read_metadata(path))
     for part in field.arrays:
@@ -179,6 +175,11 @@ def _mhd(field: _Stored, folder: Path) -> None:
             Path(os.path.relpath(chunk_path(field.path / part, index), folder.resolve())).as_posix()
             for index in range(len(field.times))
         ]
+        if "%" in chunks[0]:
+            raise InputError(
+                f"{chunks[0]}: MetaImage headers take a % in the path to a file for a number; "
+                "rename the folder"
+            )
         for index, chunk in enumerate(chunks):
             header = _mhd_header(field, [], [], chunk)
             (folder / f"{_name(part)}_{index:03d}.mhd").write_text(header)

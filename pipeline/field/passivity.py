@@ -41,21 +41,27 @@ class EnergyTank:
         self._capacity_mj = capacity_mj
         self._point_mm: Sequence[float] | None = None
         self._force_n: Triple = (0.0, 0.0, 0.0)
+        self._blind = False
 
     def passed(self, point_mm: Sequence[float], force_n: Sequence[float]) -> Triple:
         """The force to render at the tool's present point, of the one that is wanted.
 
         Where one of them is not finite nothing is rendered.
         """
-        if not math.isfinite(sum(point_mm) + sum(force_n)):
-            # No force holds from here on, so none of its work is counted wherever the tool goes.
-            self._force_n = (0.0, 0.0, 0.0)
-            return self._force_n
+        if not math.isfinite(sum(point_mm)):
+            self._blind = True
+            return 0.0, 0.0, 0.0
+        if not math.isfinite(sum(force_n)):
+            force_n = (0.0, 0.0, 0.0)
         last = self._point_mm if self._point_mm is not None else point_mm
         way = [now - before for now, before in zip(point_mm, last, strict=True)]
         way2 = _dot(way, way)
-        # What the force held since the last tick has really done.
-        self.level_mj = min(self.level_mj - _dot(self._force_n, way), self._capacity_mj)
+        # What the force held since the last tick has really done. Of a way that was not seen only
+        # what the hand may have got is counted.
+        work = _dot(self._force_n, way)
+        work = max(work, 0.0) if self._blind else work
+        self._blind = False
+        self.level_mj = min(self.level_mj - work, self._capacity_mj)
         ahead, allowed = _dot(force_n, way), max(self.level_mj, 0.0)
         x, y, z = force_n
         if way2 > 0 and (ahead > allowed or self.level_mj < 0):

@@ -83,7 +83,7 @@ def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
 def _is_rigid(pose):  # type: ignore[no-untyped-def]
     """Whether a 4x4 is a rotation and a shift, within 1e-3: the quick form of a slow check."""
     off = abs(pose[3, 0]) + abs(pose[3, 1]) + abs(pose[3, 2]) + abs(pose[3, 3] - 1.0)
-    if not off <= 1e-8 or not math.isfinite(pose[0, 3] + pose[1, 3] + pose[2, 3]):
+    if not off <= 1e-6 or not math.isfinite(pose[0, 3] + pose[1, 3] + pose[2, 3]):
         return False
     for a in range(3):
         for b in range(3):

@@ -102,9 +102,10 @@ def _require_dicom(paths: Sequence[Path]) -> None:
     others = [path for path in paths if not _begins_as_dicom(path)]
     if others:
         more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
-        if others[0].name.lower().endswith(OTHER_IMAGES):
+        image = next((one for one in others if one.name.lower().endswith(OTHER_IMAGES)), None)
+        if image:
             raise InputError(
-                f"{others[0]}{more}: is an image, but neither DICOM nor NIfTI; save the cine as "
+                f"{image}: is an image, but neither DICOM nor NIfTI; save the cine as "
                 "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
             )
         raise InputError(

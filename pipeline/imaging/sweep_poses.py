@@ -7,6 +7,7 @@ on the patient, ``Reference``, was tracked too, they hold ``ReferenceToTracker``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -23,15 +24,28 @@ _PIXEL_MM = (0.01, 4.0)
 # A marker that rests seems to move at the probe by some 0.4 mm (0.25 mm, and 0.1 degrees a hand's
 # breadth or two away), root mean square.
 _REST_MM = 0.8
+_KEPT = 0.95
 
 
-def frame_of_poses(fields: Fields, asked: str | None) -> str:
-    """The frame to which probes are tracked: what is asked for, else the tracker where it is told,
-    else the patient's reference."""
+def frame_of_poses(frames: Sequence[Fields], asked: str | None) -> str:
+    """The frame to which probes are tracked: what is asked for, else the tracker where any frame
+    tells of it, else the patient's reference.
+
+    Raises
+    ------
+    InputError
+        When what is asked for moves with the probe.
+    """
+    if asked in ("Probe", "Image"):
+        raise InputError(
+            f"us.pose_frame of study.yaml: {asked} moves with the probe; name the tracker, or a "
+            "marker on the patient"
+        )
     if asked is not None:
         return asked
-    told = _name("Probe", TRACKER) in fields or _name("Probe", REFERENCE) not in fields
-    return TRACKER if told else REFERENCE
+    told = any(_name("Probe", TRACKER) in fields for fields in frames)
+    followed = any(_name("Probe", REFERENCE) in fields for fields in frames)
+    return REFERENCE if followed and not told else TRACKER
 
 
 def is_tracked(fields: Fields, frame: str, with_calibration: bool) -> bool:
@@ -107,7 +121,9 @@ def require_resting(tracker_from_reference: Sequence[Float], probe_mm: Float, wh
     known = np.stack(tracker_from_reference)
     motion = known @ np.linalg.inv(known[0])
     places_mm = motion[:, :3, :3] @ probe_mm + motion[:, :3, 3]
-    away_mm = float(np.sqrt(places_mm.var(axis=0).sum()))
+    off_mm = np.sort(np.linalg.norm(places_mm - np.median(places_mm, axis=0), axis=1))
+    # A pose now and then that the tracker got wrong is no motion.
+    away_mm = float(np.sqrt(np.mean(off_mm[: math.ceil(_KEPT * len(off_mm))] ** 2)))
     if away_mm > _REST_MM:
         raise InputError(
             f"{where}: the patient's {REFERENCE} moves against the tracker, by {away_mm:.1f} mm "

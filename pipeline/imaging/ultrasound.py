@@ -133,7 +133,7 @@ def read_sweep(
     images, header = _read_image(path)
     images, turned = _as_scanned(path, images, header)
     frames = _frame_fields(path, header, len(images))
-    frame = frame_of_poses(frames[0], pose_frame)
+    frame = frame_of_poses(frames, pose_frame)
     own = probe_from_image is None
     valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own)]
     if not valid:

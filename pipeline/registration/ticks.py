@@ -149,7 +149,7 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     c[BEFORE:] = c[STATE:BEFORE]
     if not math.isfinite(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
         return -1
-    # The last beat counts beside the time: beats may be told in advance, in their order.
+    # The last beat counts beside the time: the next question may lie far from the last one.
     if (c[STARTED] > 0.0 or c[BEATS] > 0.0) and r_s > _latest(c) + AHEAD_S:
         return -1
     rr_s = r_s - c[LAST_R]
@@ -331,7 +331,7 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
 @compiled
 def _lose_time(c: Float, now_s: float) -> None:
     """A time that is none, or of another clock: what beats told of is worth nothing any more."""
-    if now_s >= c[NOW] - SLACK_S:
+    if math.isfinite(now_s) and now_s >= c[NOW] - SLACK_S:
         return
     _forget(c)
     c[STATE], c[GOOD], c[VALID] = LOST, 0.0, 0.0

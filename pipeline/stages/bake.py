@@ -26,10 +26,12 @@ def run(job: Job) -> dict[str, Any]:
     lost = job.figures("surface")["left_out"]
     fixtures, left_out = fixtures_for(job.settings, surfaces, lost)
     registered = job.product("register")
+    source = {"patient_id": job.study.patient_id, "beatfield": __version__}
     mr_from_tracker = None
     if registered:
-        placed = read_table(registered / "mr_from_tracker.json")["mr_from_tracker"]
-        mr_from_tracker = np.array(placed)
+        found = read_table(registered / "mr_from_tracker.json")
+        mr_from_tracker = np.array(found["mr_from_tracker"])
+        source["tracker"] = found["tracker"]
     certificate = bake_field(
         job.folder / "field.zarr",
         surfaces,
@@ -37,7 +39,7 @@ def run(job: Job) -> dict[str, Any]:
         job.settings.bake,
         mr_from_tracker=mr_from_tracker,
         rr_s=timing["rr_s"],
-        source={"patient_id": job.study.patient_id, "beatfield": __version__},
+        source=source,
         progress=job.progress,
     )
     return {

@@ -5,7 +5,7 @@
  *     #define BEATFIELD_IMPLEMENTATION
  *     #include "beatfield.h"
  *
- * and everywhere else just the #include. That file should include this header first, for POSIX
+ * and everywhere else just the #include. That file must include this header first, for POSIX
  * systems then declare what mapping files needs. No other library is needed but libm.
  *
  *     bf_field field;
@@ -130,9 +130,10 @@ bf_status bf_distance(const bf_field *field, int structure, const double point_m
                       double *distance_mm, double gradient[3]);
 
 /* The same at many points, (count, 3) numbers; phases has one number, or count of them. Gradients may
- * be NULL, distances not; scratch may be NULL. With room for BF_SCRATCH numbers a question there, questions that are many, and neither
- * whose places nor whose phases follow one another, are answered in an order of its own, several
- * times as fast; the answers are the same. Answers may not lie where the questions do. */
+ * be NULL, distances not; scratch may be NULL. With room for BF_SCRATCH numbers a question there,
+ * questions that are many, and neither whose places nor whose phases follow one another, are answered
+ * in an order of its own, several times as fast; the answers are the same. Answers may not lie where
+ * the questions do. */
 bf_status bf_distances(const bf_field *field, int structure, size_t count, const double *points_mm,
                        const double *phases, size_t phase_count, double *distances_mm,
                        double *gradients, double *scratch);
@@ -160,12 +161,12 @@ typedef struct {
 } bf_tool;
 
 /* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL), both
- * in the frame of the MR: the mean of the field's force over the tool's length, so no tool feels more than f_max. Pieces
- * are halved where the field demands it, until the error of the force is below bound_n; evaluations
- * (may be NULL) says how often the field was asked. mr_from_tool is a rotation and a shift, within
- * 1e-3, row after row; the last row is 0 0 0 1. A tool longer than 20 times the grid's diagonal is
- * in another unit: BF_WRONG_SIZE. How long an answer takes grows with the tool's length in the field's
- * reach and its number of points, and as bound_n becomes less. */
+ * in the frame of the MR: the mean of the field's force over the tool's length, so no tool feels more
+ * than f_max. Pieces are halved where the field demands it, until the error of the force is below
+ * bound_n; evaluations (may be NULL) says how often the field was asked. mr_from_tool is a rotation and
+ * a shift, within 1e-3, row after row; the last row is 0 0 0 1. A tool longer than 20 times the grid's
+ * diagonal, as one in micrometres, is refused: BF_WRONG_SIZE. How long an answer takes grows with the
+ * tool's length in the field's reach and its number of points, and as bound_n becomes less. */
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
@@ -182,8 +183,8 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
  */
 typedef struct {
     double level_mj, capacity_mj;
-    double point_mm[3], force_n[3]; /* of the last tick */
-    int started;
+    double point_mm[3], force_n[3]; /* of the last tick whose point was known */
+    int started, blind;
 } bf_tank;
 
 /* A tank that holds level_mj to begin with, and capacity_mj at most; what is no number, or less than
@@ -198,7 +199,7 @@ void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3]);
 void bf_transform(const double transform[16], const double point_mm[3], double moved_mm[3]);
 
 /* A direction, such as a force, in the target's frame as it is in the source's: turned back, not
- * shifted. The arrays may be the same. */
+ * shifted. The arrays may be the same. Zeros where something is not finite, as an unknown transform. */
 void bf_turn_back(const double transform[16], const double vector[3], double turned[3]);
 
 /* Parse the text of a store's zarr.json; bf_open does it, this is for tests. */
@@ -228,6 +229,9 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
+#ifndef O_DIRECTORY
+#error "include beatfield.h before other headers where it is implemented, or define _POSIX_C_SOURCE 200809L"
+#endif
 #endif
 /* Where the compiler can make code for a processor that it only may meet, four nodes of a row are
  * read at a time if the processor can; BEATFIELD_PLAIN leaves that out. */
@@ -474,7 +478,7 @@ static int bf__rigid(const double t[16])
 {
     double det, shift = t[3] + t[7] + t[11];
     int a, b;
-    if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-8)) return 0;
+    if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-6)) return 0;
     if (shift - shift != 0) return 0;
     for (a = 0; a < 12; a += 4)
         for (b = 0; b < 12; b += 4) {
@@ -589,7 +593,7 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
     const char *key, *text;
     size_t length, span;
     double m = 0;
-    int first = 1, inner, forbidden = -1;
+    int first = 1, inner, limited = 0, forbidden = -1;
     while (bf__key(j, &first, &key, &length)) {
         if (bf__is(key, length, "kind")) {
             bf__string(j, &text, &span);
@@ -597,8 +601,10 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
             if (!forbidden && !bf__is(text, span, "guidance")) j->bad = 1;
         } else if (bf__is(key, length, "device_limits")) {
             for (inner = 1; bf__key(j, &inner, &key, &length);) {
-                if (bf__is(key, length, "force_n")) part->device_force_n = bf__number(j);
-                else bf__skip(j, 0);
+                if (bf__is(key, length, "force_n")) {
+                    part->device_force_n = bf__number(j);
+                    limited = 1;
+                } else bf__skip(j, 0);
             }
         } else if (bf__is(key, length, "structure")) bf__string(j, structure, size);
         else if (bf__is(key, length, "delta_mm")) part->delta_mm = bf__number(j);
@@ -610,9 +616,9 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
             if (part->side < 0 && !bf__is(text, span, "inside")) j->bad = 1;
         } else if (!bf__is(key, length, "side")) bf__skip(j, 0);
     }
-    if (!(m >= 1 && m <= 1000) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
+    if (!(m >= 1 && m <= 20) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
         !(part->f_max_n > 0 && part->f_max_n < 1e9) || forbidden != (part->side != 0) ||
-        (part->device_force_n != 0 && !(part->f_max_n <= part->device_force_n)))
+        (limited && !(part->f_max_n <= part->device_force_n)))
         j->bad = 1;
     else part->m = (int)m;
 }
@@ -707,8 +713,9 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
         if (bf__is(key, span, "format_version")) version = bf__number(&j) == 1.0;
         else if (bf__is(key, span, "phases")) bf__phases(&j, field);
         else if (bf__is(key, span, "rr_s")) {
-            field->rr_s = bf__null(&j) ? 0 : bf__number(&j);
-            if (!(field->rr_s >= 0)) j.bad = 1;
+            int known = !bf__null(&j);
+            field->rr_s = known ? bf__number(&j) : 0;
+            j.bad |= known && !(field->rr_s > 0);
         } else if (bf__is(key, span, "frame")) j.bad |= !bf__says(&j, "LPS");
         else if (bf__is(key, span, "unit")) j.bad |= !bf__says(&j, "mm");
         else if (bf__is(key, span, "periodic")) {
@@ -1046,8 +1053,10 @@ static void bf__unmap(const float *values, size_t bytes, int copied)
     (void)bytes, (void)copied;
     free(start);
 #else
-    if (copied) free(start);
-    else munmap(start, bytes);
+    if (copied) {
+        munlock(start, bytes);
+        free(start);
+    } else munmap(start, bytes);
 #endif
 }
 
@@ -1079,17 +1088,18 @@ bf_status bf_open(bf_field *field, const char *path)
     char *before = NULL, *after = NULL;
     size_t length, again;
     bf__folder folder;
-    bf_status status;
+    bf_status status, now;
     memset(field, 0, sizeof *field);
     status = bf__enter(&folder, path);
     if (status != BF_OK) return status;
     status = bf__manifest(&folder, &before, &length);
     if (status == BF_OK) {
         status = bf__open_as(field, &folder, before, length);
-        /* Files may be written over while they are opened. */
-        if (bf__manifest(&folder, &after, &again) != BF_OK || again != length ||
-            memcmp(before, after, length) != 0)
+        /* Files may be written over, or taken away, while they are opened. */
+        now = bf__manifest(&folder, &after, &again);
+        if (now == BF_OK ? again != length || memcmp(before, after, length) != 0 : now == BF_NOT_A_FIELD)
             status = BF_REPLACED;
+        else if (status == BF_OK) status = now;
         if (status != BF_OK) bf_close(field);
     }
     free(before);
@@ -1116,7 +1126,8 @@ static bf_status bf__copy(bf_field *field)
         return BF_NO_MEMORY;
     }
     for (at = 0; at < count; at++) {
-        const float **values = &field->structure[at / (size_t)field->phases].coefficients[at % (size_t)field->phases];
+        const bf_structure_part *part = &field->structure[at / (size_t)field->phases];
+        const float **values = &part->coefficients[at % (size_t)field->phases];
         bf__unmap(*values, field->bytes, 0);
         *values = (const float *)copies[at];
     }
@@ -1787,10 +1798,13 @@ void bf_transform(const double t[16], const double point_mm[3], double moved_mm[
 void bf_turn_back(const double transform[16], const double vector[3], double turned[3])
 {
     const double *t = transform;
-    double x = vector[0], y = vector[1], z = vector[2];
+    double x = vector[0], y = vector[1], z = vector[2], sum;
     turned[0] = t[0] * x + t[4] * y + t[8] * z;
     turned[1] = t[1] * x + t[5] * y + t[9] * z;
     turned[2] = t[2] * x + t[6] * y + t[10] * z;
+    /* Of a tracker that is not known no force is handed on. */
+    sum = turned[0] + turned[1] + turned[2];
+    if (sum - sum != 0) turned[0] = turned[1] = turned[2] = 0;
 }
 
 /* ---- whole tools ---- */
@@ -1974,13 +1988,15 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
 
 void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
 {
-    double way[3], way2 = 0, work = 0, ahead = 0, sound = 0, allowed, share;
+    double way[3], way2 = 0, work = 0, ahead = 0, place = 0, wanted = 0, allowed, share;
     int axis;
-    for (axis = 0; axis < 3; axis++) sound += point_mm[axis] + force_n[axis];
-    if (sound - sound != 0) {
-        /* No force holds from here on, so none of its work is counted wherever the tool goes. */
-        memset(tank->force_n, 0, sizeof tank->force_n);
-        force_n[0] = force_n[1] = force_n[2] = 0;
+    for (axis = 0; axis < 3; axis++) {
+        place += point_mm[axis];
+        wanted += force_n[axis];
+    }
+    if (place - place != 0 || wanted - wanted != 0) force_n[0] = force_n[1] = force_n[2] = 0;
+    if (place - place != 0) {
+        tank->blind = 1;
         return;
     }
     if (!tank->started) {
@@ -1993,8 +2009,10 @@ void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
         work += tank->force_n[axis] * way[axis];
         ahead += force_n[axis] * way[axis];
     }
-    /* What the force held since the last tick has really done: newtons times mm are millijoules. */
-    tank->level_mj -= work;
+    /* What the force held since the last tick has really done: newtons times mm are millijoules. Of a
+     * way that was not seen only what the hand may have got is counted. */
+    if (!tank->blind || work > 0) tank->level_mj -= work;
+    tank->blind = 0;
     if (tank->level_mj > tank->capacity_mj) tank->level_mj = tank->capacity_mj;
     allowed = tank->level_mj > 0 ? tank->level_mj : 0;
     /* The next step will be much like the last. In debt, only force against the motion is left. */

@@ -61,7 +61,7 @@ typedef struct {
 
 typedef struct {
     double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
-    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it */
+    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it, to 1 */
     int withheld;                  /* 0; set it while no force is wanted, as of a tool outside the grid */
     double now_s;
     int started;
@@ -358,7 +358,7 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
     c->before = c->known;
     if (!isfinite(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
         return BF_NO_BEAT;
-    /* The last beat counts beside the time: beats may be told in advance, in their order. */
+    /* The last beat counts beside the time: the next question may lie far from the last one. */
     if ((c->started || c->known.beats > 0.0) && r_s > bfc_latest(c) + BFC_AHEAD_S)
         return BF_NO_BEAT;
     rr_s = r_s - c->known.last_r_s;
@@ -397,13 +397,14 @@ static double bfc_place(const bf_clock *c, double now_s, double rr_s)
 static void bfc_watch(bf_clock *c, double now_s, int usable)
 {
     double waited_s = now_s - c->known.last_r_s;
+    double latency_s = c->latency_s > 0.0 && c->latency_s <= 1.0 ? c->latency_s : BFC_LATENCY_S;
     if (!usable || c->known.beats < 1.0 || waited_s > 3.0 * c->known.rr_s) {
         c->known.rhythm = BF_LOST;
         c->known.needed = 3;
         c->known.good = 0;
         c->valid = 0;
         c->known.gap = 1;
-    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + c->latency_s) {
+    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + latency_s) {
         c->known.rhythm = c->known.rhythm == BF_REGULAR ? BF_LOST : c->known.rhythm;
         c->known.good = 0;
         c->valid = 0;
@@ -438,7 +439,7 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
 /* A time that is none, or of another clock: what beats told of is worth nothing any more. */
 static void bfc_lose_time(bf_clock *c, double now_s)
 {
-    if (now_s >= c->now_s - BFC_SLACK_S)
+    if (isfinite(now_s) && now_s >= c->now_s - BFC_SLACK_S)
         return;
     bfc_forget(c);
     c->known.rhythm = BF_LOST;
