@@ -319,7 +319,6 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
     if c[BEATS] > 0.0 and c[LAST_R] > now_s + SLACK_S:
         # Left in, it would shift the phase, and make true beats come too late.
         _forget(c)
-        c[VALID] = 0.0
     _watch(c, now_s, usable)
     _turn(c, before_s, now_s)
     reach = c[FADE_PER_S] * min(passed_s, SLACK_S)

@@ -461,10 +461,8 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
         c->started = 1;
         c->now_s = now_s;
         /* Left in, it would shift the phase, and make true beats come too late. */
-        if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_SLACK_S) {
+        if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_SLACK_S)
             bfc_forget(c);
-            c->valid = 0;
-        }
         bfc_watch(c, now_s, usable);
         bfc_turn(c, now_s - passed_s, now_s);
         c->fade += bfc_min(bfc_max((double)(c->valid && !c->withheld) - c->fade, -reach), reach);
