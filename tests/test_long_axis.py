@@ -77,6 +77,23 @@ def test_a_view_is_one_however_its_direction_is_rounded(tmp_path: Path, digits: 
     assert view.cine.intensity.shape[0] == PHASES
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ImagePositionPatient": [9, 9, 10]},
+        {"PixelSpacing": [1.3, 1.3]},
+        {"ImageOrientationPatient": [0, 1, 0, 0.01, 0, -np.sqrt(1 - 1e-4)]},
+    ],
+)
+def test_views_beside_one_another_are_two(tmp_path: Path, changes: dict[str, Any]) -> None:
+    write_dicom(tmp_path)
+    place = {"ImagePositionPatient": [9, 9, 9], "PixelSpacing": [1.25, 1.25]}
+    add_view(tmp_path, 0, **place)
+    add_view(tmp_path, 1, **(place | changes))
+    _, views = read_dicom_study(tmp_path)
+    assert [len(view.cine.intensity) for view in views] == [PHASES, PHASES]
+
+
 def test_views_written_then_read_are_the_same(tmp_path: Path) -> None:
     write_dicom(tmp_path / "cine")
     add_view(tmp_path / "cine", 0)

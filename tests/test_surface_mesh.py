@@ -12,7 +12,7 @@ from surface_shapes import crossing_triangles, ellipsoid, two_lobes, voxel_centr
 from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Surface
-from pipeline.meshes import read_mesh
+from pipeline.meshes import read_mesh, write_vtp
 from pipeline.surface.level_set import LevelSet, smooth_level_set
 from pipeline.surface.mesh import (
     adjacency,
@@ -178,6 +178,14 @@ def test_a_mesh_is_read_in_the_frame_that_its_file_names(
     assert (note in content) is (ending != ".vtp")
     middle = read_mesh(path).vertices_mm.mean(axis=0)
     np.testing.assert_allclose(middle, (30, -50, 10) if space == "LPS" else (-30, 50, 10), atol=0.1)
+
+
+def test_a_written_mesh_says_in_which_frame_it_is(tmp_path: Path) -> None:
+    ball = pyvista.Sphere(radius=5.0, center=(30, -50, 10))
+    surface = Surface(np.asarray(ball.points, float), np.asarray(ball.regular_faces, np.int64))
+    write_vtp(tmp_path / "ball.vtp", surface)
+    assert pyvista.read(tmp_path / "ball.vtp").field_data["SPACE"][0] == "LPS"
+    np.testing.assert_array_equal(read_mesh(tmp_path / "ball.vtp").vertices_mm, surface.vertices_mm)
 
 
 @pytest.mark.parametrize(("ending", "binary"), [
