@@ -104,10 +104,7 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
     left, right = room[-2], room[-3]
     walk[0], walk[1], walk[2] = 0.0, 0.0, 0.0
     total = _length(line_mm)
-    diagonal2 = 0.0
-    for axis in range(3):
-        diagonal2 += ((grid[6 + axis] - 1.0) * grid[3 + axis]) ** 2
-    if total > LONGEST * math.sqrt(diagonal2):
+    if total > LONGEST * _diagonal(grid):
         return total, -1
     if len(line_mm) > 1:
         walk[2] = _piece_length(line_mm, 0)
@@ -149,6 +146,13 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
             _halve(stack, places, top, left, right)
             top += 1
     return total, asked
+
+
+@njit(**INNER)
+def _diagonal(grid):  # type: ignore[no-untyped-def]
+    """Length of the grid from corner to corner."""
+    x, y, z = (grid[6] - 1) * grid[3], (grid[7] - 1) * grid[4], (grid[8] - 1) * grid[5]
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @njit(**INNER)
