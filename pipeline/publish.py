@@ -124,11 +124,11 @@ def remove(path: Path) -> None:
 def _remove_orphans(target: Path) -> None:
     """Clear away what killed processes left unfinished of one target."""
     start = f".{target.name}{PARTIAL}"
-    for path in target.parent.iterdir():
-        pid = path.name.removeprefix(start)
-        if path.name.startswith(start) and pid.isdecimal() and not _lives(int(pid)):
-            # What is another user's is theirs to clear away.
-            with suppress(OSError):
+    # What is another user's is theirs to clear away.
+    with suppress(OSError):
+        for path in target.parent.iterdir():
+            pid = path.name.removeprefix(start)
+            if path.name.startswith(start) and pid.isdecimal() and not _lives(int(pid)):
                 remove(path)
 
 
