@@ -113,7 +113,8 @@ def test_a_pose_now_and_then_is_no_motion(tmp_path):
         fields[start + "ProbeToTrackerTransform"] = text(rigid(k))
         fields[start + "ReferenceToTrackerTransform"] = text(place)
         fields[start + "ImageToProbeTransform"] = text(calibration())
-    read_sweeps(files(write(tmp_path / "s.mha", fields, pixels)))
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields, pixels)))
+    assert (sweep.pose_frame, len(sweep.numbers)) == ("Tracker", many)
 
 
 def test_a_frame_that_moves_with_the_probe_is_none_for_poses(tmp_path):
