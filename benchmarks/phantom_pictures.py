@@ -60,7 +60,7 @@ def slices(cine: SyntheticCine, middle: int) -> Figure:
     for axis, z in zip(figure.subplots(1, 3), (middle - 2, middle, middle + 3), strict=True):
         low, high = np.percentile(cine.intensity[0, z], (1, 99.7))
         axis.imshow(cine.intensity[0, z], cmap="gray", vmin=low, vmax=high)
-        axis.set_title(f"slice {z + 1}", fontsize=9)
+        axis.set_title(f"slice {z}", fontsize=9)
         axis.set_axis_off()
     return figure
 
@@ -74,7 +74,7 @@ def frames(study: SyntheticStudy) -> Figure:
         chosen = np.linspace(0, len(sweep.images) - 1, FRAMES_OF_A_SWEEP).round().astype(int)
         for axis, k in zip(row, chosen, strict=True):
             axis.imshow(sweep.images[k], cmap="gray", vmin=0, vmax=255)
-            axis.set_title(f"{sweep.name}, frame {k + 1}", fontsize=9)
+            axis.set_title(f"{sweep.name}, frame {k}", fontsize=9)
             axis.set_axis_off()
     return figure
 

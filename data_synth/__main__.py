@@ -35,10 +35,17 @@ def _write_patients(options: argparse.Namespace) -> None:
     if options.patients < 1:
         raise SynthError(f"--patients is {options.patients}; give 1 or more")
     first = read_settings(options.config, _changes(options))
-    patients = [
-        first.model_copy(update={"seed": first.seed + k, "patient_id": f"patient-{k + 1:04d}"})
-        for k in range(options.patients)
-    ]
+    patients = [first]
+    if options.patients > 1:
+        if "patient_id" in first.model_fields_set:
+            raise SynthError(
+                f"patient_id is {first.patient_id}, the name of one, and --patients is "
+                f"{options.patients}; leave one of them out"
+            )
+        patients = [
+            first.model_copy(update={"seed": first.seed + k, "patient_id": f"patient-{k + 1:04d}"})
+            for k in range(options.patients)
+        ]
     for settings in patients:
         require_free(options.out / settings.patient_id, options.overwrite)
     for settings in patients:

@@ -33,6 +33,7 @@ from data_synth.dicom_header import (
     window,
 )
 from data_synth.protocol import MrSettings
+from data_synth.sampling import acquisition_window
 
 ENHANCED_MR_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.4.1"
 PROTON_MHZ_PER_T = 42.577478518
@@ -297,7 +298,7 @@ def _own(series: ImageSeries, z: int, k: int) -> dict[str, Any]:
     """Functional groups of one frame: what it is, where it lies, when it was."""
     cine, position = series.cine, series.slices.index(z) + 1
     trigger_ms, rr_ms = float(cine.trigger_times_ms[z, k]), float(cine.rr_ms[z])
-    window_ms = rr_ms / len(cine.intensity)
+    window_ms = rr_ms * acquisition_window(len(cine.intensity))
     middle = series.moment(z) + timedelta(milliseconds=trigger_ms)
     start = middle - timedelta(milliseconds=window_ms / 2)
     return {

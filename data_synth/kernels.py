@@ -17,6 +17,12 @@ Label = npt.NDArray[np.uint8]
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
+# Compiled functions, and the numbers that they take for constants.
+_SOURCES = (
+    *("kernels", "tissue", "primitives", "profiles", "splines", "lining", "motion", "anatomy"),
+    *("thorax", "speckle"),
+)
+
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Compile a numeric function to machine code; the result is kept on disk between runs.
@@ -34,8 +40,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 @cache
 def _digest() -> str:
-    names = ("kernels", "primitives", "profiles", "lining", "motion", "anatomy", "thorax")
-    sources = [Path(__file__).with_name(f"{name}.py").read_bytes() for name in names]
+    sources = [Path(__file__).with_name(f"{name}.py").read_bytes() for name in _SOURCES]
     return "numba-" + hashlib.sha256(b"".join(sources)).hexdigest()[:12]
 
 

@@ -52,8 +52,9 @@ def tube(x: float, y: float, z: float, line: Float) -> float:
         t = min(max(t, 0.0), 1.0)
         px, py, pz = px - t * ex, py - t * ey, pz - t * ez
         radius = ar + t * (line[k + 1, 3] - ar)
-        squared = px * px + py * py + pz * pz
-        if squared < (best + radius) ** 2:
+        squared, reach = px * px + py * py + pz * pz, best + radius
+        # Deep inside a thicker piece nothing of a thinner one is nearer: then this is negative.
+        if reach > 0 and squared < reach * reach:
             best = math.sqrt(squared) - radius
     return best
 

@@ -31,6 +31,12 @@ SEQUENCES = (0.7548776662466927, 0.5698402909980532, 0.6180339887498949)
 BLOOD = np.isin(np.arange(len(Tissue)), BLOOD_TISSUES)
 
 
+def acquisition_window(phases: int) -> float:
+    """Share of the cycle in which a frame of a cine of so many phases is acquired."""
+    # Few phases are a long cine of which few are kept, not frames of a third of a heartbeat.
+    return min(1 / phases, LONGEST_WINDOW)
+
+
 class Samples(NamedTuple):
     """Where and when a voxel is looked at."""
 
@@ -204,9 +210,7 @@ class Slice:
         if sample >= 0:
             offset = self.offsets_mm[sample]
             instant = float(self.view.samples.instants[sample])
-        # Few phases are a long cine of which few are kept, not frames of a third of a heartbeat.
-        window = min(1 / self.settings.phases, LONGEST_WINDOW)
-        nominal = self._nominal(phase + instant * window)
+        nominal = self._nominal(phase + instant * acquisition_window(self.settings.phases))
         return self.heart.heart_tissue(self.moved[which] + offset, nominal)
 
     def _mixed(self, middle: Label, probe: Label) -> npt.NDArray[np.intp]:

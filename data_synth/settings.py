@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -55,7 +56,7 @@ class PhantomSettings(BaseModel):
     seed: int = Field(default=1, ge=0)
     """From which everything is drawn; patient k of a batch has the first one's seed + k."""
     patient_id: str = Field(default="patient-0001", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    """Name of the study's folder, and PatientID in DICOM."""
+    """Name of the study's folder, and PatientID in DICOM; of one patient alone."""
     pathology: Pathology = "healthy"
     """What ails the heart; with one seed it befalls the same person."""
     spread: float = Field(default=1.0, ge=0, le=2)
@@ -124,6 +125,20 @@ def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:
         raise SynthError(describe(error, where)) from error
 
 
+def _instead(place: tuple[int | str, ...]) -> str:
+    """What to do about an unknown key."""
+    model: type[BaseModel] = PhantomSettings
+    for part in place[:-1]:
+        field = model.model_fields.get(str(part))
+        kinds = [field.annotation, *get_args(field.annotation)] if field else []
+        below = [one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)]
+        if not below:
+            return "check its spelling"
+        model = below[0]
+    near = get_close_matches(str(place[-1]), list(model.model_fields), 1)
+    return f"did you mean {near[0]}?" if near else "check its spelling"
+
+
 def describe(error: ValidationError, where: str) -> str:
     """Every fault on a line of its own: file, key, what is wrong, what came."""
     lines = []
@@ -131,6 +146,6 @@ def describe(error: ValidationError, where: str) -> str:
         key = ".".join(str(part) for part in one["loc"]) or "(all)"
         message = one["msg"].removeprefix("Value error, ")
         if one["type"] == "extra_forbidden":
-            message = "unknown key; check its spelling"
+            message = f"unknown key; {_instead(one['loc'])}"
         lines.append(f"{where}: {key}: {message} (got {one['input']!r})")
     return "\n".join(lines)

@@ -20,6 +20,7 @@ from data_synth.dicom_header import unique_identifier
 from data_synth.errors import SynthError
 from data_synth.mr import SyntheticCine
 from data_synth.protocol import MrSettings
+from data_synth.sampling import LONGEST_WINDOW
 from pipeline.geometry import transform_points
 from pipeline.imaging.dicom import read_dicom_cine
 
@@ -242,6 +243,16 @@ def test_pixels_place_and_time_of_every_frame_are_the_phantoms(written: Written)
         assert float(rr_ms) == source.rr_ms[z]
         seen += 1
     assert seen == (5 + 3) * PHASES
+
+
+def test_a_frame_lasts_as_long_as_it_was_acquired(enhanced: Written) -> None:
+    """One of few phases is kept of many: it is none of a third of a heartbeat."""
+    assert PHASES < 1 / LONGEST_WINDOW
+    for data in enhanced.objects():
+        for frame in data.PerFrameFunctionalGroupsSequence:
+            content, gating = frame.FrameContentSequence[0], frame.CardiacSynchronizationSequence[0]
+            lasted_ms = LONGEST_WINDOW * gating.RRIntervalTimeNominal
+            assert content.FrameAcquisitionDuration == pytest.approx(lasted_ms)
 
 
 def test_an_itk_reader_sees_a_classic_slice_where_it_is(classic: Written) -> None:

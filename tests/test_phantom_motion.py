@@ -27,6 +27,7 @@ from data_synth.breathing import BREATHING_AXIS, Breathing, breath_hold_mm, free
 from data_synth.errors import SynthError
 from data_synth.heart import BeatingHeart
 from data_synth.population import PATHOLOGIES, draw_heart
+from data_synth.primitives import tube
 from data_synth.tissue import TRUTH_LABELS, Tissue, truth_values
 
 INFARCT = {"infarct_strength": 1.0, "infarct_angle": 0.9, "infarct_height": 0.6}
@@ -389,3 +390,8 @@ def test_breath_holds_scatter_as_asked_and_repeat_by_seed():
 def test_impossible_breathing_is_refused(bad):
     with pytest.raises(ValidationError):
         Breathing(**bad)
+
+
+def test_deep_in_a_thick_piece_of_a_tube_a_thin_one_beside_it_changes_nothing():
+    line = np.array([[0.0, 0, 0, 10], [0, 0, 20, 10], [1, 0, 20, 1], [1, 0, 10, 1]])
+    assert tube(0.0, 0.0, 10.0, line) == pytest.approx(-10.0)

@@ -10,6 +10,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from PIL import Image
 
 from data_synth import PhantomSettings, SyntheticStudy, simulate_study, write_preview
@@ -17,6 +19,7 @@ from data_synth.ecg import simulate_ecg
 from data_synth.ecg_settings import EcgSettings
 from data_synth.norms import NORMS
 from data_synth.preview import curves, images, page, scene
+from data_synth.preview.style import STYLES
 from data_synth.tissue import TRUTH_LABELS
 from data_synth.truth import mr_from_image
 from pipeline.study import open_study
@@ -144,6 +147,18 @@ def test_surfaces_are_drawn_from_three_sides_at_both_moments(html: str) -> None:
         assert (border > 235).all(), "cut off at the edge"
 
 
+def test_a_sweep_of_one_frame_does_not_keep_the_heart_from_being_drawn(
+    study: SyntheticStudy, html: str
+) -> None:
+    if "cannot draw in three dimensions" in html:
+        pytest.skip("no off-screen drawing here")
+    (fan,) = (page.fans_of(sweep) for sweep in study.sweeps)
+    one = scene.Fans(fan.outlines_mm[:1], fan.corners_mm, fan.image)
+    moments = {"end-diastole": study.heart.surfaces(0.0)}
+    drawn = scene.draw_scenes(moments, study.heart.rotation, {"sweep_000": one})
+    assert {"end-diastole/front", "sweep/front"} <= set(drawn)
+
+
 def test_a_study_without_ecg_ultrasound_and_views_has_a_page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -171,6 +186,16 @@ def test_truth_outlines_on_ultrasound_lie_on_what_is_seen(study: SyntheticStudy)
         muscle = grey[labels == TRUTH_LABELS["lv_myocardium"][0]].astype(float)
         assert min(blood.size, muscle.size) > 30
         assert np.median(muscle) > np.median(blood) + 20
+
+
+def test_the_cavitys_line_is_over_the_muscles_where_they_meet() -> None:
+    labels = np.zeros((20, 20), np.uint8)
+    labels[4:16, 4:16] = TRUTH_LABELS["lv_myocardium"][0]
+    labels[8:12, 8:12] = TRUTH_LABELS["lv_cavity"][0]
+    axis = Figure().subplots()
+    images._contours(axis, labels, np.arange(20), np.arange(20))
+    drawn = [to_hex(one.get_edgecolor()[0]).upper() for one in axis.collections]
+    assert drawn == [STYLES[name][0] for name in ("lv_myocardium", "lv_cavity")]
 
 
 def test_fans_lie_where_the_pictures_are(study: SyntheticStudy) -> None:

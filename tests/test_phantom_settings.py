@@ -44,7 +44,9 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("cine: film", r"cine.*dicom.*enhanced.*nifti"),
         ("colour: red", "colour: unknown key"),
         ("mr:\n  slices: 8\n  slices: 9", "line 3: slices is given a second time, after line 2"),
-        ("mr: {flavour: 1}", r"mr\.flavour: unknown key"),
+        ("mr: {flavour: 1}", r"mr\.flavour: unknown key; check its spelling"),
+        ("mr: {snrr: 20}", r"mr\.snrr: unknown key; did you mean snr\?"),
+        ("pathologie: infarct", r"unknown key; did you mean pathology\?"),
         ("- 1", "keys and values"),
         ("mr: [", "cannot be read as YAML"),
         ("mr: !!map foo", "cannot be read as YAML"),
@@ -79,6 +81,21 @@ def test_flags_lie_over_the_settings_of_the_file(tmp_path, monkeypatch):
     assert settings.spread == 0.5
     assert preview
     assert not overwrite
+
+
+def test_one_patient_keeps_the_name_that_the_file_gives(tmp_path, monkeypatch, capsys):
+    config = tmp_path / "mine.yaml"
+    config.write_text("patient_id: robot-01\n")
+    made = []
+    monkeypatch.setattr("data_synth.study.write_study", lambda *given: made.append(given[:2]))
+    command = [str(tmp_path / "o"), "--config", str(config)]
+    assert main(command) == 0
+    ((folder, settings),) = made
+    assert folder == tmp_path / "o" / "robot-01"
+    assert settings.patient_id == "robot-01"
+    assert main([*command, "--patients", "2"]) == 2
+    assert "patient_id is robot-01" in capsys.readouterr().err
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def stack_grid(cine: SyntheticCine, number: int) -> Figure:
     window = heart_window(cine)
     for axis, z in zip(axes, shown, strict=False):
         _slice(axis, cine, number, int(z), window)
-        axis.set_title(f"slice {z + 1}", fontsize=8, pad=2)
+        axis.set_title(f"slice {z}", fontsize=8, pad=2)
     for axis in axes[len(shown) :]:
         axis.set_axis_off()
     _legend(figure)
@@ -77,7 +77,7 @@ def ultrasound_row(sweep: Sweep, heart: BeatingHeart) -> Figure:
             axis.set_axis_off()
         places = np.arange(0, columns, OUTLINE_STEP), np.arange(0, rows, OUTLINE_STEP)
         _contours(axes[1, column], labels, *places)
-        title = f"frame {k + 1}, phase {sweep.phases[k]:.2f}"
+        title = f"frame {k}, phase {sweep.phases[k]:.2f}"
         axes[0, column].set_title(title, fontsize=8)
     _legend(figure)
     return figure
@@ -171,8 +171,9 @@ def _grey_window(images: Any) -> tuple[float, float]:
 
 
 def _contours(axis: Axes, labels: Label, x: Any, y: Any) -> None:
-    for name, (value, _) in TRUTH_LABELS.items():
-        mask = labels == value
+    # The muscle first: its inner border is the cavity's, whose colour is to be seen there.
+    for name in sorted(TRUTH_LABELS, key=lambda name: name != "lv_myocardium"):
+        mask = labels == TRUTH_LABELS[name][0]
         if mask.any() and min(mask.shape) > 1:
             colour, style = STYLES[name]
             axis.contour(x, y, mask, levels=[0.5], colors=colour, linestyles=style, linewidths=1.1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from data_synth.heart import BeatingHeart
 from data_synth.kernels import Float
-from data_synth.measures import MUSCLE_G_ML
+from data_synth.measures import MUSCLE_G_ML, wall_thickness_mm
 from data_synth.norms import NORMS
 from data_synth.preview import curves, images, scene
 from data_synth.preview.style import as_svg, as_webp, encode, words
@@ -95,7 +95,11 @@ def _summary(study: SyntheticStudy) -> list[tuple[str, str]]:
 def _counted(sweeps: tuple[Sweep, ...]) -> str:
     if not sweeps:
         return "none"
-    return f"{len(sweeps)} sweeps, {sum(len(sweep.images) for sweep in sweeps)} frames"
+    frames = sum(len(sweep.images) for sweep in sweeps)
+    return ", ".join(
+        f"{count} {what}{'s' * (count != 1)}"
+        for count, what in ((len(sweeps), "sweep"), (frames, "frame"))
+    )
 
 
 def _heart(study: SyntheticStudy) -> dict[str, Any]:
@@ -114,7 +118,8 @@ def _heart(study: SyntheticStudy) -> dict[str, Any]:
         row = [drawn[f"sweep/{side}"] for side in ("front", "left")]
         caption = (
             "the sweeps from the front and from the patient's left: the transducer's path "
-            "(thick), outlines of four pictures of each; right, its middle picture in its place"
+            "(thick), outlines of four pictures of each; right, its middle picture in its place; "
+            f"{_coloured(fans)}"
         )
         pictures.append(_picture(encode([np.concatenate(row, axis=1)]), caption))
     phases = np.arange(CURVE_POINTS) / CURVE_POINTS
@@ -122,6 +127,12 @@ def _heart(study: SyntheticStudy) -> dict[str, Any]:
     pictures.append(_picture(graph, "volumes enclosed by the truth meshes", "svg+xml"))
     note = "" if drawn else "This machine cannot draw in three dimensions: surfaces are left out."
     return {"title": "The heart", "note": note, "pictures": pictures, "is_heart": True}
+
+
+def _coloured(names: Iterable[str]) -> str:
+    """Which sweep is drawn in which colour, in words."""
+    colours = zip(names, scene.PROBES.values(), strict=False)
+    return ", ".join(f"{name} {colour}" for name, colour in colours)
 
 
 def fans_of(sweep: Sweep) -> scene.Fans:
@@ -147,7 +158,7 @@ def fans_of(sweep: Sweep) -> scene.Fans:
 def _short_axis(study: SyntheticStudy, systole: int) -> dict[str, Any]:
     cine = study.cine
     pictures = [
-        _picture(as_webp(images.stack_grid(cine, number), 90), f"{moment}, apex to base")
+        _picture(as_webp(images.stack_grid(cine, number), 90), f"{moment}, apex to base, from 0")
         for moment, number in (("end-diastole", 0), ("end-systole", systole))
     ]
     seconds = float(cine.rr_ms.mean()) / 1000
@@ -190,7 +201,10 @@ def _ecg(study: SyntheticStudy) -> list[dict[str, Any]]:
         "during ultrasound; ticks: frames": curves.ecg_strip(study.us_ecg, first, times_s),
     }
     pictures = [_picture(as_svg(strip), name, "svg+xml") for name, strip in strips.items()]
-    note = "Dotted lines: true R peaks; N normal, V premature ventricular, f in fibrillation."
+    note = (
+        "Dotted lines: true R peaks; N normal, A premature atrial, V premature ventricular, "
+        "f in fibrillation."
+    )
     return [{"title": "ECG", "note": note, "pictures": pictures}]
 
 
@@ -200,14 +214,20 @@ def _function_rows(heart: BeatingHeart) -> list[dict[str, str]]:
     for chamber, function in chamber_function(heart).items():
         values |= {f"{chamber}.{figure}": value for figure, value in function.items()}
     values["lv_mass_g"] = MUSCLE_G_ML * heart.volumes_ml(0.0)["lv_myocardium"]
+    walls_mm = wall_thickness_mm(heart)
+    values["left_ventricle.thinnest_wall_mm"] = float(walls_mm.min())
+    values["left_ventricle.thickest_wall_mm"] = float(walls_mm.max())
     rows = []
     for name, value in values.items():
-        digits = 3 if name.endswith("fraction") else 0
+        digits = 3 if name.endswith("fraction") else int(name.endswith("_mm"))
         norm = NORMS.get(name)
         rows.append(
             {
                 "name": words(
-                    name.replace(".", ", ").replace("_ml", " (ml)").replace("_g", " (g)")
+                    name.replace(".", ", ")
+                    .replace("_mm", " (mm)")
+                    .replace("_ml", " (ml)")
+                    .replace("_g", " (g)")
                 ),
                 "value": f"{value:.{digits}f}",
                 "range": f"{norm.low:.{digits}f} to {norm.high:.{digits}f}" if norm else "",

@@ -44,7 +44,7 @@ NAMED = {
     "cut": ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium"),
 }
 """View -> meshes that bear their short name in it: those that are seen from there."""
-PROBES = ("#222222", "#7B3294", "#8C510A")
+PROBES = {"#222222": "black", "#7B3294": "purple", "#8C510A": "brown"}
 """Of sweeps: none is that of a chamber."""
 SIZE_PIXELS = (460, 460)
 TIME_LIMIT_S = 120
@@ -219,7 +219,9 @@ def _sweeps(meshes: dict[str, Any], fans: list[Fans], hung: bool) -> Any:
         for outline in fan.outlines_mm[shown]:
             closed = np.vstack([outline, outline[:1]])
             plotter.add_mesh(pyvista.MultipleLines(closed), color=colour, line_width=2)
-        plotter.add_mesh(pyvista.MultipleLines(fan.outlines_mm[:, 0]), color=colour, line_width=6)
+        path = fan.outlines_mm[:, 0]
+        if len(path) > 1:
+            plotter.add_mesh(pyvista.MultipleLines(path), color=colour, line_width=6)
         if hung:
             _hang(plotter, fan)
     return plotter
