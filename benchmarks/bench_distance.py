@@ -9,8 +9,8 @@ Peers are libigl, Open3D and VTK; one that cannot be imported is left out. They 
 dependencies of this project: install them into an environment of their own that has numba, SciPy
 and scikit-image too (``pip install libigl open3d vtk numba scipy scikit-image``), and run this
 file with its Python. Everybody uses all processors that it would use by itself, and pays for its
-own tree, signs and query points; compilation, imports and meshes are outside. Runs alternate, ours
-before and after every peer's, and the least time of each counts. ``core-s`` is processor time of
+own tree, signs and query points; compilation, imports and meshes are outside. All take turns,
+equally often, and the least time of each counts. ``core-s`` is processor time of
 all threads: where others use the machine, its ratios are the ones to trust. ``error`` is the
 largest difference to the first peer's distance, within 15 mm and beyond; ``signs`` counts nodes
 with another sign.
@@ -22,8 +22,10 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
@@ -36,8 +38,9 @@ from pipeline.geometry import Float, Float32, Grid, Surface
 
 CUBE_MM = 128.0
 BAND_MM = 15.0
-# VTK would need a minute or more: it is asked for every 64th node, and its time multiplied.
-VTK_SHARE = 64
+# VTK would need a minute or more: it is asked for every 61st node, and the time of that multiplied.
+# Of a number that divides the nodes of a row all would lie in one plane or two, far from the mesh.
+VTK_SHARE = 61
 
 
 def cup(x: Float, y: Float, z: Float) -> Float:
@@ -92,24 +95,37 @@ def cube(nodes: int) -> Grid:
     return Grid((nodes,) * 3, (0.5 * step - 0.5 * CUBE_MM,) * 3, (step,) * 3)
 
 
-Solver = Callable[[], Float | Float32]
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How somebody finds the distances of all nodes."""
+
+    ask: Callable[[Any], Float | Float32]
+    """With what was made ready."""
+
+    share: int = 1
+    """It is asked for one node in so many."""
+
+    ready: Callable[[], Any] = lambda: None
+    """What is done once, however many nodes are asked for."""
 
 
-def libigl(surface: Surface, grid: Grid) -> tuple[Solver, int]:
+def libigl(surface: Surface, grid: Grid) -> Way:
     """libigl's tree, sign by pseudonormals."""
     import igl
 
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    return lambda: igl.signed_distance(
-        grid.nodes_mm().reshape(-1, 3), surface.vertices_mm, surface.triangles, kind
-    )[0], 1
+    return Way(
+        lambda _: igl.signed_distance(
+            grid.nodes_mm().reshape(-1, 3), surface.vertices_mm, surface.triangles, kind
+        )[0]
+    )
 
 
-def open3d(surface: Surface, grid: Grid) -> tuple[Solver, int]:
+def open3d(surface: Surface, grid: Grid) -> Way:
     """Open3D's ray-casting scene (Embree), sign by one ray."""
     import open3d as o3d
 
-    def solve() -> Float32:
+    def solve(_: Any) -> Float32:
         scene = o3d.t.geometry.RaycastingScene()
         vertices = o3d.core.Tensor(surface.vertices_mm.astype(np.float32))
         scene.add_triangles(vertices, o3d.core.Tensor(surface.triangles.astype(np.uint32)))
@@ -117,27 +133,35 @@ def open3d(surface: Surface, grid: Grid) -> tuple[Solver, int]:
         found: Float32 = scene.compute_signed_distance(points, nsamples=1).numpy()
         return found
 
-    return solve, 1
+    return Way(solve)
 
 
-def vtk(surface: Surface, grid: Grid) -> tuple[Solver, int]:
-    """VTK's implicit distance, for every 64th node."""
+def vtk(surface: Surface, grid: Grid) -> Way:
+    """VTK's implicit distance, for every 61st node."""
     import vtkmodules.vtkFiltersCore  # noqa: F401
 
-    from pipeline.field.exact import vtk_distance
+    from pipeline.field.exact import ExactSurface
 
-    return lambda: vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)[::VTK_SHARE]), VTK_SHARE
+    def ready() -> tuple[ExactSurface, Float]:
+        exact, points = ExactSurface(surface), grid.nodes_mm().reshape(-1, 3)[::VTK_SHARE]
+        # The first question builds what is not built yet.
+        exact.distance_mm(points[:1])
+        return exact, points
+
+    return Way(lambda made: made[0].distance_mm(made[1]), VTK_SHARE, ready)
 
 
 PEERS = {"libigl": libigl, "open3d": open3d, "vtk": vtk}
 
 
-def timed(solve: Solver) -> tuple[Float, Float | Float32]:
+def timed(way: Way) -> tuple[Float, Float | Float32]:
     """Seconds by the clock and of all processors together; and what came out, as one row."""
     start = np.array([time.perf_counter(), time.process_time()])
-    found = solve()
+    made = way.ready()
+    middle = np.array([time.perf_counter(), time.process_time()])
+    found = way.ask(made)
     end = np.array([time.perf_counter(), time.process_time()])
-    return end - start, found.reshape(-1)
+    return middle - start + way.share * (end - middle), found.reshape(-1)
 
 
 def compare(surface: Surface, grid: Grid, rounds: int, peers: Sequence[str]) -> None:
@@ -146,25 +170,21 @@ def compare(surface: Surface, grid: Grid, rounds: int, peers: Sequence[str]) -> 
     print("| method | s | times ours | core-s | times ours | error <= 15 mm | beyond | signs |")
     print("|---" * 8 + "|")
     distance_of_closed(surface, cube(8))
-    best, ours = timed(lambda: distance_of_closed(surface, grid))
-    rows, exact = {}, None
+    ways = {"ours": Way(lambda _: distance_of_closed(surface, grid))}
     for peer in peers:
-        try:
-            solve, share = PEERS[peer](surface, grid)
-        except ImportError:
-            continue
-        least = np.full(2, np.inf)
-        for _ in range(rounds):
-            seconds, found = timed(solve)
-            least = np.minimum(least, share * seconds)
-            for _ in range(2):
-                best = np.minimum(best, timed(lambda: distance_of_closed(surface, grid))[0])
-        rows[peer] = least, found, share
-        exact = (found, share) if exact is None else exact
-    rows = {"ours": (best, ours, 1), **rows}
-    for name, (seconds, found, share) in rows.items():
-        cells = [f"{s:.3f} | {ratio:.1f}" for s, ratio in zip(seconds, seconds / best, strict=True)]
-        print(f"| {name} | {' | '.join(cells)} | {errors(found, share, exact)} |", flush=True)
+        with suppress(ImportError):
+            ways[peer] = PEERS[peer](surface, grid)
+    least, found = {name: np.full(2, np.inf) for name in ways}, {}
+    for _ in range(rounds):
+        for name, way in ways.items():
+            seconds, found[name] = timed(way)
+            least[name] = np.minimum(least[name], seconds)
+    exact = next(((found[name], ways[name].share) for name in ways if name != "ours"), None)
+    for name, seconds in least.items():
+        ratios = zip(seconds, seconds / least["ours"], strict=True)
+        cells = [f"{one:.3f} | {ratio:.1f}" for one, ratio in ratios]
+        said = errors(found[name], ways[name].share, exact)
+        print(f"| {name} | {' | '.join(cells)} | {said} |", flush=True)
 
 
 def errors(found: Float | Float32, share: int, exact: tuple[Float | Float32, int] | None) -> str:
@@ -196,7 +216,8 @@ def curve(rounds: int) -> None:
     for wanted, nodes in cases:
         surface, grid = cup_surface(wanted), cube(nodes)
         distance_of_closed(surface, cube(8))
-        runs = [timed(partial(distance_of_closed, surface, grid))[0] for _ in range(rounds)]
+        way = Way(lambda _, s=surface, g=grid: distance_of_closed(s, g))
+        runs = [timed(way)[0] for _ in range(rounds)]
         clock, least = (float(one) for one in np.min(runs, axis=0))
         terms.append((nodes**3, len(surface.triangles), nodes * len(surface.triangles)))
         seconds.append(least)

@@ -9,8 +9,8 @@ phases is what that took on a quiet machine.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -241,8 +241,11 @@ def test_query(benchmark: BenchmarkFixture, tmp_path: Path, capsys: object) -> N
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Time questions to a field beside peers.")
+    parser.add_argument("field", type=Path, nargs="?", help="default: one of the default study")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
-        chosen = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(place) / "field.zarr"
+        chosen = options.field or Path(place) / "field.zarr"
         if not chosen.exists():
             bake_study(chosen, 25)
         print(table(measure(chosen)))

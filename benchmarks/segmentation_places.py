@@ -23,10 +23,11 @@ import segmentation_tables as tables
 
 from data_synth.heart import BeatingHeart
 from data_synth.simulate import load_heart, settings_of
-from pipeline.evaluation.metrics import distances_mm, surface_samples
+from pipeline.evaluation.metrics import surface_samples
 from pipeline.geometry import Float, MovingSurface
 from pipeline.meshes import read_mesh
 from pipeline.products import read_cine, read_surfaces
+from pipeline.surface.measures import signed_distances_mm
 
 Names = npt.NDArray[np.str_]
 Mask = npt.NDArray[np.bool_]
@@ -164,7 +165,9 @@ def points_of(
         known, found = read_mesh(truth / f"{name}_{number:03d}.vtp"), moving.at(number)
         on_found, on_known = (surface_samples(one, SAMPLES) for one in (found, known))
         # Outside truth is too large; where truth's own point lies outside, it is too small.
-        off_mm = np.concatenate([distances_mm(on_found, known), -distances_mm(on_known, found)])
+        off_mm = np.concatenate(
+            [signed_distances_mm(on_found, known), -signed_distances_mm(on_known, found)]
+        )
         both_mm = np.concatenate([on_found, on_known])
         lies = places(name, heart, both_mm, float(phase))
         lies[roof.is_above(both_mm)] = BEYOND

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import DEFAULT_FIXTURES, BakeSettings, Fixture
+from pipeline.field.metadata import require_name
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.registration.settings import RegisterSettings
 from pipeline.surface.settings import SurfaceSettings
@@ -33,6 +34,17 @@ class Settings(BaseModel):
     def _has_a_fixture(cls, fixtures: dict[str, Fixture]) -> dict[str, Fixture]:
         if not fixtures:
             raise ValueError("at least one fixture is needed; leave the key out for the default")
+        return fixtures
+
+    @field_validator("fixtures")
+    @classmethod
+    def _can_be_stored(cls, fixtures: dict[str, Fixture]) -> dict[str, Fixture]:
+        """Each gets a folder of its name, which the bake stage, minutes later, would refuse."""
+        for name in fixtures:
+            try:
+                require_name(name, "fixture")
+            except InputError as error:
+                raise ValueError(str(error)) from error
         return fixtures
 
 

@@ -44,12 +44,14 @@ def require_rigid(transform: Float, where: str) -> None:
     last = float(np.abs(transform[3] - (0, 0, 0, 1)).sum())
     proper = off <= _RIGID
     if not proper or np.linalg.det(rotation) < 0 or last > _LAST_ROW:
-        hint = (
-            "; it looks transposed: its shift stands in the last row, and belongs in the last "
-            "column, above the 1"
-            if proper and transform[3, :3].any() and not transform[:3, 3].any()
-            else ""
-        )
+        hint = ""
+        if proper and np.linalg.det(rotation) < 0:
+            hint = "; it mirrors: between RAS and LPS two axes turn, not one"
+        elif proper and transform[3, :3].any() and not transform[:3, 3].any():
+            hint = (
+                "; it looks transposed: its shift stands in the last row, and belongs in the last "
+                "column, above the 1"
+            )
         raise InputError(
             f"{where}: is not a rotation and a shift (its axes miss length 1 and right angles by "
             f"{off:.2g}, {_RIGID:g} is allowed), got\n{transform}{hint}"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Surface
+from pipeline.geometry import Float, Integer, Surface
 
 MESH_ENDINGS = (".vtp", ".stl", ".ply")
 
@@ -35,7 +35,8 @@ def write_vtp(path: Path, surface: Surface) -> None:
 def read_mesh(path: Path) -> Surface:
     """Read a triangle mesh in LPS; vertices that STL repeats for every triangle become one.
 
-    A file that says it is in RAS, as 3D Slicer notes in what it saves, is turned.
+    A file that says it is in RAS, as 3D Slicer notes in what it saves, is turned. Triangles that
+    name a vertex twice and vertices that no triangle names are left out: they are no surface.
 
     Raises
     ------
@@ -56,7 +57,24 @@ def read_mesh(path: Path) -> Surface:
         raise InputError(f"{path}: cannot be read as a surface ({error})") from error
     if not isinstance(mesh, pyvista.PolyData) or not mesh.n_cells or not len(triangles):
         raise InputError(f"{path}: holds no triangles; a closed surface is needed")
+    if triangles.min() < 0 or triangles.max() >= len(vertices_mm):
+        raise InputError(
+            f"{path}: triangles name vertices {triangles.min()} to {triangles.max()}, there are "
+            f"{len(vertices_mm)}; export the surface again"
+        )
+    vertices_mm, triangles = _what_bounds(vertices_mm, triangles)
+    if not len(triangles):
+        raise InputError(f"{path}: all its triangles are lines or points; export the surface again")
     return Surface(_in_lps(vertices_mm, path, mesh), triangles)
+
+
+def _what_bounds(vertices: Float, triangles: Integer) -> tuple[Float, Integer]:
+    """Triangles with three corners, and their vertices. It goes by numbers alone, so that vertices
+    that correspond through the phases still do."""
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    used, numbers = np.unique(triangles, return_inverse=True)
+    return vertices[used], numbers.reshape(triangles.shape)
 
 
 def _in_lps(vertices_mm: Float, path: Path, mesh: Any) -> Float:

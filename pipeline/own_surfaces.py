@@ -22,9 +22,10 @@ from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.files import read_metadata
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
-from pipeline.field.metadata import require_name
+from pipeline.field.metadata import require_name, require_phases
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, Surface
+from pipeline.field.winding import winding_number
+from pipeline.geometry import Surface, require_rigid
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.publish import only_run_in, publishing, sha256_of
 from pipeline.surface.crossings import crossing_triangles
@@ -118,8 +119,11 @@ def what_was_baked(field: Path) -> list[str]:
     """How exact a field is, and what its fixtures do: some may be defaults that nobody wrote."""
     baked = ForceField.open(field)
     off_mm = baked.accuracy["surface_error_p99_mm"]
-    exact = f"accuracy  {off_mm:.2g} mm off on the surfaces at most, in 99 places of 100"
-    return [exact] + [
+    count = len(baked.phases)
+    return [
+        f"phases    {count}{', so nothing moves' if count == 1 else ''}",
+        f"accuracy  {off_mm:.2g} mm off on the surfaces at most, in 99 places of 100",
+    ] + [
         f"fixture   {name}: {one.kind.replace('_', ' ')}{f' {one.side}' if one.side else ''} of "
         f"{one.structure}, {one.f_max_n:g} N at most, next to nothing within "
         f"{one.resolved_gamma_mm:.1f} mm, for the {one.device.name}"
@@ -158,7 +162,7 @@ def _wrong_shell(surface: Surface) -> str:
         outwards = Surface(surface.vertices_mm, surface.triangles[own]).volume_mm3() > 0
         place_mm = surface.vertices_mm[surface.triangles[own][0, 0]]
         corners_mm = surface.vertices_mm[surface.triangles[~own]] - place_mm
-        within = round(_winding_number(corners_mm))
+        within = round(winding_number(corners_mm))
         if within != (0 if outwards else 1):
             facing = "outwards, within another" if outwards else "inwards, within no other"
             x, y, z = (f"{one:.1f}" for one in place_mm)
@@ -166,18 +170,6 @@ def _wrong_shell(surface: Surface) -> str:
                 f"a shell (at {x} {y} {z} mm) that faces {facing}: take it out, or turn its normals"
             )
     return ""
-
-
-def _winding_number(corners_mm: Float) -> float:
-    """How often triangles ``(n, 3, 3)`` wind around the origin.
-
-    Solid angles by van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30:125-126 (1983).
-    """
-    a, b, c = corners_mm.transpose(1, 0, 2)
-    p, q, r = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-    triple = (a * np.cross(b, c)).sum(axis=1)
-    around = p * q * r + (a * b).sum(axis=1) * r + (a * c).sum(axis=1) * q + (b * c).sum(axis=1) * p
-    return float(np.arctan2(triple, around).sum() / (2 * np.pi))
 
 
 def measure_field(
@@ -354,7 +346,7 @@ def _files_by_structure(folder: Path) -> dict[str, list[Path]]:
     if not found:
         raise InputError(
             f"{folder}: holds no {', '.join(MESH_ENDINGS)} files; name them STRUCTURE_000.vtp, "
-            "STRUCTURE_001.vtp ..., one a phase"
+            "STRUCTURE_001.vtp ..., one a phase; save others, such as OBJ, as one of these"
         )
     for structure, phases in found.items():
         require_name(structure, f"{folder}: structure")
@@ -381,6 +373,8 @@ def _place(folder: Path, path: Path) -> tuple[str, int]:
 
 def _timing(path: Path, phase_count: int) -> Timing:
     timing = _read_timing(path) if path.exists() else Timing()
+    if timing.mr_from_tracker is not None:
+        require_rigid(np.array(timing.mr_from_tracker), f"{path}: mr_from_tracker")
     if timing.phases is None:
         evenly = tuple(k / phase_count for k in range(phase_count))
         return timing.model_copy(update={"phases": evenly})
@@ -388,6 +382,10 @@ def _timing(path: Path, phase_count: int) -> Timing:
         raise InputError(
             f"{path}: {len(timing.phases)} phases for {phase_count} surfaces; give one each"
         )
+    try:
+        require_phases(list(timing.phases), f"{path}: phases")
+    except ValueError as error:
+        raise InputError(str(error)) from error
     return timing
 
 

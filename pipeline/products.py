@@ -156,7 +156,8 @@ def write_frames(path: Path, rows: Sequence[FrameRow]) -> None:
 
 
 def _rounded(row: FrameRow) -> list[str]:
-    return [f"{value:.6f}" for value in (row.time_s, row.phase, row.residual)]
+    # A phase that is rounded up to 1 is that of the next beat's beginning.
+    return [f"{value:.6f}" for value in (row.time_s, round(row.phase, 6) % 1, row.residual)]
 
 
 def read_frames(path: Path) -> list[FrameRow]:

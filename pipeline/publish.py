@@ -236,6 +236,23 @@ def sealed(folder: Path) -> dict[str, Any] | None:
     return content if intact else None
 
 
+def require_unaltered(folder: Path) -> None:
+    """Refuse a product that holds other bytes than were sealed: nothing is to be made of it.
+
+    Raises
+    ------
+    InputError
+        When a file's digest is not that in ``stage.json``.
+    """
+    content = sealed(folder)
+    for name, entry in content["files"].items() if content else ():
+        if sha256_of(folder / name) != entry["sha256"]:
+            raise InputError(
+                f"{folder / name}: is not what the stage {folder.name} wrote: it was edited, or "
+                f"damaged on the disk; run that stage again (--from {folder.name})"
+            )
+
+
 def fingerprint(parts: Mapping[str, Any]) -> str:
     """SHA-256 of JSON-able parts; order counts, as it does for fixtures, whose first leads."""
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

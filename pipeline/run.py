@@ -26,6 +26,7 @@ from pipeline.publish import (
     only_run_in,
     publishing,
     remove,
+    require_unaltered,
     seal,
     sealed,
     sha256_of,
@@ -54,9 +55,13 @@ STAGES = (
     Stage("ingest", inputs=("cine", "mr_ecg")),
     Stage("segment", after=("ingest",), settings=("segment",)),
     Stage("surface", after=("ingest", "segment"), settings=("surface",)),
-    Stage("register", after=("surface",), inputs=("us",), settings=("register",)),
+    Stage("register", after=("ingest", "surface"), inputs=("us",), settings=("register",)),
     Stage("bake", after=("ingest", "surface", "register"), settings=("bake", "fixtures")),
-    Stage("evaluate", after=("segment", "surface", "register", "bake"), inputs=("truth",)),
+    Stage(
+        "evaluate",
+        after=("ingest", "segment", "surface", "register", "bake"),
+        inputs=("truth",),
+    ),
     Stage(
         "report",
         after=("ingest", "segment", "surface", "register", "bake", "evaluate"),
@@ -147,6 +152,12 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         run.watcher.ended(stage.name, "unchanged", 0.0)
         run.stages[stage.name] = _entry(run, stage.name, "done", standing["figures"], key)
         return
+    skipped = _skipped_before(run, stage, key)
+    if skipped and not target.exists() and not force:
+        # To find that ultrasound cannot be registered takes minutes.
+        run.watcher.ended(stage.name, f"skipped: {skipped['cause']}", 0.0)
+        run.stages[stage.name] = skipped
+        return
     run.watcher.started(stage.name)
     clock, memory = time.perf_counter(), PeakMemory()
     try:
@@ -225,16 +236,23 @@ def _standing(run: _Run, stage: Stage, holds: bool) -> dict[str, Any] | None:
     key = _fingerprint(run, stage)
     standing = sealed(run.products / stage.name)
     if standing is None:
-        earlier = _earlier(run, stage.name)
-        skipped = earlier.get("status") == "skipped" and earlier.get("fingerprint") == key
-        return dict(earlier) if holds and skipped else None
+        return _skipped_before(run, stage, key) if holds else None
     made_from = standing["fingerprint"]
     status = "done" if holds and made_from == key else "stale"
     return _entry(run, stage.name, status, standing["figures"], made_from)
 
 
+def _skipped_before(run: _Run, stage: Stage, key: str) -> dict[str, Any] | None:
+    """What an earlier run said of a stage that had nothing to do, if that was of the same."""
+    earlier = _earlier(run, stage.name)
+    same = earlier.get("status") == "skipped" and earlier.get("fingerprint") == key
+    return dict(earlier) if same and isinstance(earlier.get("cause"), str) else None
+
+
 def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
     module = importlib.import_module(f"pipeline.stages.{stage.name}")
+    for name in stage.after:
+        require_unaltered(run.products / name)
     with publishing(target) as folder:
         job = Job(run.study, run.settings, run.products, folder, run.watcher.progress)
         figures: dict[str, Any] = module.run(job)
@@ -252,7 +270,10 @@ def _fingerprint(run: _Run, stage: Stage) -> str:
             "inputs": {kind: run.inputs[kind] for kind in stage.inputs},
             "study": _described(run.study, stage),
             "settings": {name: settings[name] for name in stage.settings},
-            "before": {name: one and one["files"] for name, one in before.items()},
+            # What a stage noticed stands among its figures alone, and later ones repeat it.
+            "before": {
+                name: one and (one["files"], one["figures"]) for name, one in before.items()
+            },
             "code": code_digest(f"pipeline.stages.{stage.name}"),
             "libraries": library_versions(),
         }

@@ -17,6 +17,22 @@ MUSCLE_RANGE = 1.4
 its labels are told to be doubtful: the most was 1.09 in 23 studies of the phantom, and 1.29 in 24
 stacks of a second renderer, noisy or of thick slices; images with inverted contrast gave 1.89."""
 
+EARLIEST_SYSTOLE, LATEST_SYSTOLE = 0.17, 0.15
+"""Share of the beat by which the left ventricle's end of systole may lie before and after its usual
+place (`pipeline.registration.clock.systole_s`). A pulse reaches the finger a fifth of a beat after
+the R peak or later; phases in reverse lie as far off in slow hearts, in fast ones by less."""
+
+LEAST_EJECTION = 0.15
+"""Of a heart that ejects less than this share, noise decides when it is smallest."""
+
+LARGEST_DELAY_S = 0.1
+"""A scanner stamps its frames later than they are by tens of milliseconds."""
+
+TOO_FAR_FOR_A_CLOCK = (
+    "; far for a scanner's delay: if it is the MR's phases that do not begin at the R peak, forces "
+    "come that much at the wrong time"
+)
+
 
 def summary(record: dict[str, Any], products: Path) -> str:
     """A line for each stage, then what to look at.
@@ -69,8 +85,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
         *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
         *_orientation(segment),
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
-        *_doubtful(segment),
-        *[("doubtful", text) for text in muscle_changes(segment)],
+        *[("doubtful", text) for text in doubts(segment, figures.get("surface", {}))],
         *_left_out(figures),
     ]
 
@@ -108,17 +123,20 @@ def cut_off_by(cut_off: dict[str, dict[Any, int]], ingest: dict[str, Any]) -> li
     ]
 
 
-def _doubtful(segment: dict[str, Any]) -> list[tuple[str, str]]:
+def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
+    """Sentences on what speaks against labels or times, of the figures of two stages."""
+    return [*low_confidence(segment), *muscle_changes(segment), *odd_systole(surface)]
+
+
+def low_confidence(segment: dict[str, Any]) -> list[str]:
+    """A sentence where the least certain labels are far below the others."""
     lowest = segment.get("lowest_confidence", 1.0)
     if lowest >= TOLD_BELOW:
         return []
     at = segment["least_certain"]
     return [
-        (
-            "doubtful",
-            f"labels of slice {at['slice']} in phase {at['phase']}, whose confidence of "
-            f"{lowest:.2f} is the lowest; the report shows all below {LOW_CONFIDENCE:g}",
-        )
+        f"labels of slice {at['slice']} in phase {at['phase']}, whose confidence of "
+        f"{lowest:.2f} is the lowest; the report shows all below {LOW_CONFIDENCE:g}"
     ]
 
 
@@ -131,6 +149,26 @@ def muscle_changes(segment: dict[str, Any]) -> list[str]:
     return [
         f"labels: of heart muscle phase {least} has {volumes_ml[least]:.0f} ml and phase {most} "
         f"{volumes_ml[most]:.0f} ml, though muscle keeps its volume; look at the contours"
+    ]
+
+
+def odd_systole(surface: dict[str, Any]) -> list[str]:
+    """A sentence where the left ventricle is smallest when it cannot be after an R peak.
+
+    Phases that do not begin at the R peak move with the heart as well as others do, and ultrasound
+    fits them at an offset of its clock: nothing else tells, and each force comes at another time.
+    """
+    found = surface.get("end_systole")
+    if not found or surface.get("lv_ejection_fraction", 0.0) < LEAST_EJECTION:
+        return []
+    late = (found["phase"] - found["usual"] + 0.5) % 1 - 0.5
+    if -EARLIEST_SYSTOLE <= late <= LATEST_SYSTOLE:
+        return []
+    return [
+        f"times: the left ventricle is smallest at phase {found['phase']:.2f}, where "
+        f"{found['usual']:.2f} is usual at this heart rate; were images gated by the pulse at a "
+        "finger, by another wave than R, or stored in reverse? Then forces come at the wrong time: "
+        "give times after the R peak"
     ]
 
 
@@ -168,14 +206,21 @@ def _verdict(register: dict[str, Any]) -> list[str]:
     wider = ", widened by calibration: per_sweep" if figures["calibration"] else ""
     because = f", because: {figures['reason']}" if figures["reason"] else ""
     lines = [f"verdict   registration {line}{wider}{because}"]
-    applied_s = figures.get("us_clock_applied_s", 0.0)
-    if applied_s:
-        way = "ahead of" if applied_s > 0 else "behind"
-        lines.append(
-            f"clock     ultrasound {abs(applied_s):.3f} s {way} its ECG, which was put right "
-            "(register.clock_offset)"
-        )
+    lines += [f"clock     {text}" for text in clock_put_right(figures)]
     return lines
+
+
+def clock_put_right(register: dict[str, Any]) -> list[str]:
+    """A sentence where the times of the ultrasound were corrected."""
+    applied_s = register.get("us_clock_applied_s", 0.0)
+    if not applied_s:
+        return []
+    way = "ahead of" if applied_s > 0 else "behind"
+    far = TOO_FAR_FOR_A_CLOCK if abs(applied_s) > LARGEST_DELAY_S else ""
+    return [
+        f"ultrasound {abs(applied_s):.3f} s {way} its ECG, which was put right "
+        f"(register.clock_offset){far}"
+    ]
 
 
 def _timed(stage: dict[str, Any]) -> bool:

@@ -90,6 +90,21 @@ int main(int count, char **words)
         needle.points_mm = line;
         while (scanf("%lf", &line[5]) == 1)
             printf("%d\n", bf_tool_force(&field, 0, &needle, pose, 0, 0.05, out, torque, NULL));
+    } else if (!strcmp(command, "outside")) {
+        double line[12] = {0, 0, 0, 5, 0, 0, 5, 40, 0, 5, 40, -70}, pose[16];
+        bf_tool bent = {NULL, 4, 0, {0, 0, 0}};
+        int n = 0;
+        bent.points_mm = line;
+        while (scanf("%lf", &pose[n % 16]) == 1) {
+            if (++n % 16) continue;
+            bent.count = 4;
+            bent.closed = 0;
+            printf("%.17g ", bf_outside_share(&field, &bent, pose));
+            bent.closed = 1;
+            printf("%.17g ", bf_outside_share(&field, &bent, pose));
+            bent.count = 1;
+            printf("%.17g\n", bf_outside_share(&field, &bent, pose));
+        }
     } else if (!strcmp(command, "often")) {
         int n;
         for (n = 0; n < 200 && status == BF_OK; n++) {

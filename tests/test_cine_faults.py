@@ -10,8 +10,10 @@ import nibabel
 import numpy as np
 import pytest
 from cine_files import dicom_frame, write_dicom
+from pydicom.dataset import Dataset
 
 from pipeline.errors import InputError
+from pipeline.imaging import dicom
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.faults import (
@@ -21,6 +23,7 @@ from pipeline.imaging.faults import (
     require_finite,
     require_room_for_a_heart,
 )
+from pipeline.imaging.frames import Frame, choose_stack
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.study import open_study
 
@@ -182,6 +185,12 @@ def test_slices_of_two_patients_are_no_stack(tmp_path: Path) -> None:
         read_dicom_study(tmp_path)
 
 
+def test_a_stack_knows_its_patient(tmp_path: Path) -> None:
+    """Whom an ECG is compared with."""
+    write_dicom(tmp_path, told_by_half(PatientID=("A17", "A17")))
+    assert read_dicom_study(tmp_path)[0].patient == "A17"
+
+
 def test_slices_in_two_frames_of_reference_are_told(tmp_path: Path) -> None:
     write_dicom(tmp_path, told_by_half(FrameOfReferenceUID=("1.2.3", "1.2.4")))
     (remark,) = read_dicom_study(tmp_path)[0].remarks
@@ -229,6 +238,14 @@ def test_timing_as_windows_writes_it_is_read(tmp_path: Path) -> None:
     assert stack.trigger_times_ms[3].tolist() == [0, 160, 320, 480, 640]
 
 
+@pytest.mark.parametrize("moment", ["null", "NaN"])
+def test_a_trigger_time_that_is_no_number_is_named(tmp_path: Path, moment: str) -> None:
+    timing = tmp_path / "timing.json"
+    timing.write_text(f'{{"trigger_times_ms": [0, 160, {moment}, 480, 640], "rr_ms": 800}}')
+    with pytest.raises(InputError, match=r"timing\.json: the trigger time of slice 0, phase 2, is"):
+        read_nifti_cine(saved(tmp_path / "cine.nii"), timing)
+
+
 def test_an_rr_interval_of_ones_own_that_does_not_fit_is_named(tmp_path: Path) -> None:
     timing = tmp_path / "timing.json"
     timing.write_text('{"trigger_times_ms": [0, 160, 320, 480, 640], "rr_ms": 800}')
@@ -242,6 +259,42 @@ def study_of(folder: Path, *names: str) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()
     return folder
+
+
+def stack_of_frames(kind: str, slices: tuple[int, ...]) -> list[Frame]:
+    """Three moments of some slices, alike in all but their kind."""
+    return [
+        Frame(
+            f"{kind} {z} {phase}",
+            np.full((4, 4), 100 * z + 10 * phase + len(kind)),
+            np.array([0.0, 0.0, 8.0 * z]),
+            np.eye(3)[:2],
+            (1.4, 1.4),
+            {"trigger time": 250.0 * phase},
+            800.0,
+            kind,
+            kind,
+            kind,
+        )
+        for z in slices
+        for phase in range(3)
+    ]
+
+
+def test_what_stands_in_for_a_slice_counts_when_other_images_of_it_are_judged() -> None:
+    stack = stack_of_frames("original", (0, 1, 3, 4)) + stack_of_frames("derived", (2,))
+    chosen, left_out = choose_stack(stack + stack_of_frames("phase", (0, 1, 2, 3, 4)), "folder")
+    assert {frame.kind for frame in chosen} == {"original", "derived"}
+    assert {one.reason for one in left_out} == {
+        "phase images, slices that the stack has already, 4 x 4 pixels"
+    }
+
+
+@pytest.mark.parametrize("image_type", ["DERIVED", ["DERIVED", "SECONDARY"]])
+def test_a_derived_image_is_known_by_one_value_too(image_type: Any) -> None:
+    data = dicom_frame(0, 0)
+    data.ImageType = image_type
+    assert dicom._kind(data, Dataset()) == "derived"
 
 
 def test_files_that_systems_leave_are_not_taken_for_images(tmp_path: Path) -> None:

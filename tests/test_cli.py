@@ -103,6 +103,10 @@ def test_a_wrong_command_ends_with_exit_code_2(
             "fixtures: {f: {structure: s, kind: guidance, delta_mm: 1, f_max_n: 3}}",
             "smallest width that would do",
         ),
+        (
+            "fixtures: {a b: {structure: aorta, kind: guidance, delta_mm: 9, f_max_n: 1}}",
+            "fixtures: fixture name 'a b': needs letters, digits",
+        ),
         ("a: [", "cannot be read as YAML"),
         ("7", "needs sections"),
     ],
@@ -252,6 +256,9 @@ def test_the_summary_says_what_the_registration_is_worth(
     assert "clock" not in summary(record, tmp_path)
     stage["figures"] |= {"us_clock_applied_s": -0.3}
     assert "clock     ultrasound 0.300 s behind its ECG, which" in summary(record, tmp_path)
+    assert "the MR's phases that do not begin" in summary(record, tmp_path)
+    stage["figures"] |= {"us_clock_applied_s": 0.06}
+    assert "the MR's phases that do not begin" not in summary(record, tmp_path)
     stage["status"] = "stale"
     assert "verdict" not in summary(record, tmp_path)
     stage.update(status="skipped", cause="no tracked ultrasound", figures={})
@@ -295,6 +302,29 @@ def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Pa
     for stage in stages.values():
         stage["status"] = "stale"
     assert len(summary({"status": "done", "stages": stages}, tmp_path).splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("phase", "ejection", "odd"),
+    [
+        (0.44, 0.6, False),
+        (0.30, 0.6, False),
+        (0.16, 0.6, True),
+        (0.96, 0.6, True),
+        (0.16, 0.1, False),
+    ],
+)
+def test_the_summary_doubts_phases_that_do_not_begin_at_the_r_peak(
+    tmp_path: Path, phase: float, ejection: float, odd: bool
+) -> None:
+    systole = {"phase": phase, "usual": 0.44}
+    figures = {"end_systole": systole, "lv_ejection_fraction": ejection}
+    stages = {"surface": {"status": "done", "figures": figures}}
+    said = summary({"status": "done", "stages": stages}, tmp_path)
+    assert ("doubtful  times: the left ventricle is smallest at phase 0.16" in said) == (
+        odd and phase == 0.16
+    )
+    assert ("by the pulse at a finger" in said) == odd
 
 
 def test_an_interruption_says_what_is_kept(

@@ -213,6 +213,17 @@ def test_a_beat_of_another_clock_is_refused_and_changes_nothing(wrong_s):
     assert clock.at(20.0).valid
 
 
+def test_beats_as_near_to_each_other_as_their_spread_stop_nothing():
+    """A monitor that tells a beat twice: the interval less its spread is nothing to divide by."""
+    clock = PhaseClock(1.0)
+    clock.beat(0.0)
+    clock.beat(0.05)
+    assert clock.next_rr_s == 0.05
+    tick = clock.at(0.06)
+    assert np.isfinite([tick.phase, tick.sd]).all()
+    assert not tick.valid
+
+
 def test_how_far_ahead_a_beat_may_lie():
     clock = PhaseClock(0.8)
     clock.at(10.0)

@@ -139,6 +139,15 @@ int main(void)
 """
 
 
+def test_beats_as_near_to_each_other_as_their_spread_are_pythons(program):
+    rows = np.array([[0, 0.0, 0], [0, 0.05, 0], [1, 0.06, 1]])
+    given = np.array([1.0, 4.0, 0.14]).tobytes() + rows.tobytes()
+    done = subprocess.run([program], input=given, capture_output=True, check=True)
+    found = np.frombuffer(done.stdout).reshape(-1, 6)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found, by_python(rows, 1.0, 0.14), rtol=0, atol=1e-9)
+
+
 def test_a_clock_of_nonsense_is_never_valid_and_renders_nothing(tmp_path):
     (tmp_path / "wrong.c").write_text(NEVER_VALID)
     command = ["gcc", "-std=c99", *STRICT, *SANITIZE, f"-I{get_include()}"]

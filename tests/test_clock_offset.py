@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ellipsoid_heart import moving_surfaces, record, start_off
 
+from pipeline.errors import InputError
 from pipeline.registration.clock_offset import Timing, estimate_offset, settle_clock
 from pipeline.registration.pose_search import climb
 from pipeline.registration.search import Best, prepare_search
@@ -102,6 +103,20 @@ def test_frames_at_the_ends_of_the_ecg_do_not_stop_the_search(recording, surface
     timing = replace(timing, r_times_s=R_TIMES_S[last_s > R_TIMES_S])
     found = estimated(recording, surfaces, timing)
     assert abs(found.offset_s - 0.1) < 0.010
+
+
+def test_an_offset_may_put_frames_more_than_a_beat_outside_the_ecg():
+    """They stay at its end, as at every trial offset."""
+    times_s = R_TIMES_S[0] - 0.9 * RR_S + 0.2 * np.arange(40)
+    timing = Timing([times_s, times_s + 0.1], R_TIMES_S, RR_S)
+    first, second = timing.phases(0.3)
+    assert len(first) == len(second) == 40
+    assert first[0] == pytest.approx(0.001)
+    inside = times_s - 0.3 > R_TIMES_S[0]
+    np.testing.assert_allclose(first[inside], (times_s[inside] - 0.3 - 0.3) / RR_S % 1, atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate([first, second]), timing.at(np.arange(80), 0.3))
+    with pytest.raises(InputError, match="more than one beat outside"):
+        replace(timing, times_s=[times_s - 0.2]).phases(0.3)
 
 
 def settled(recording, surfaces, timing, choice):

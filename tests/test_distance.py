@@ -376,3 +376,12 @@ NAN[7, 1] = np.nan
 def test_unusable_surfaces_are_refused(surface, words):
     with pytest.raises(InputError, match=rf"my\.stl: .*{words}"):
         signed_distance(surface, cube_grid(12, 5), where="my.stl")
+
+
+def test_vertices_that_lie_where_others_do_are_told():
+    """As VTK's cylinder and cube have them: no hole is to be found there."""
+    whole = box((-4, -3, -2), (2, 3, 5))
+    corners_mm = whole.vertices_mm[whole.triangles.ravel()]
+    apart = Surface(corners_mm, np.arange(len(corners_mm)).reshape(-1, 3))
+    with pytest.raises(InputError, match=r"is not closed, 36 edges .*; merge the 28 vertices"):
+        signed_distance(apart, cube_grid(8, 9))

@@ -15,7 +15,7 @@ from pydicom.sequence import Sequence
 from pydicom.uid import ExplicitVRLittleEndian
 
 from pipeline.errors import InputError
-from pipeline.imaging.ecg import read_ecg
+from pipeline.imaging.ecg import other_patient, read_ecg
 
 RATE_HZ = 250.0
 # Every value is a whole number of the 1 microvolt steps of the files below.
@@ -152,6 +152,30 @@ def test_dicom_waveform_is_read_in_millivolts(tmp_path):
     ecg = read_ecg(write_dicom(tmp_path / "ecg.dcm"))
     np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0, rtol=0, atol=1e-9)
     assert (ecg.leads, ecg.sampling_rate_hz) == (("I", "II"), RATE_HZ)
+
+
+def test_an_ecg_of_another_patient_than_the_cine_is_told(tmp_path):
+    path = write_dicom(tmp_path / "ecg.dcm")
+    assert other_patient(read_ecg(path), "4711", path) == []
+    with pydicom.dcmread(path) as dataset:
+        dataset.PatientID = " 4712"
+        dataset.save_as(tmp_path / "named.dcm")
+    named = read_ecg(tmp_path / "named.dcm")
+    assert other_patient(named, "4712", path) == other_patient(named, "", path) == []
+    [told] = other_patient(named, "4711", path)
+    assert told.startswith(f"{path} has the PatientID '4712', the cine '4711': make sure")
+
+
+def test_dicom_samples_that_stand_for_none_are_a_gap(tmp_path):
+    steps = STEPS_UV.copy()
+    steps[300:320, 1] = -32768
+    group = waveform_group(steps, "uV")
+    group.WaveformPaddingValue = b"\x00\x80"
+    path = write_dicom(tmp_path / "ecg.dcm", [group])
+    with pytest.raises(InputError, match="lead II: 20 of 1000 samples are not a number"):
+        read_ecg(path)
+    found_mv = read_ecg(path, gaps=True).signal_mv
+    np.testing.assert_array_equal(np.isnan(found_mv), steps == -32768)
 
 
 def test_dicom_recording_is_preferred_to_the_averaged_beat(tmp_path):

@@ -232,6 +232,22 @@ def test_truth_of_another_cine_is_refused(job: Job) -> None:
         evaluate.run(job)
 
 
+def test_a_chamber_without_a_surface_has_no_ejection_fraction(job: Job) -> None:
+    for path in (job.products / "surface").glob("rv_*"):
+        path.unlink()
+    evaluate.run(job)
+    metrics = json.loads((job.folder / "metrics.json").read_text())
+    assert metrics["rv_ejection_fraction"] == {"found": None, "truth": round(1 - (2 / 3) ** 3, 4)}
+    assert set(metrics["structures"]) == {"lv_endocardium", "epicardium"}
+
+
+def test_truth_of_other_phases_is_refused(job: Job) -> None:
+    phases = [*PHASES.tolist(), 0.9]
+    write_table(job.products / "ingest" / "phases.json", {"phases": phases})
+    with pytest.raises(InputError, match="its phases are not those of the cine"):
+        evaluate.run(job)
+
+
 def test_truth_whose_meshes_do_not_correspond_has_no_motion(job: Job) -> None:
     """Distances remain."""
     assert job.study.truth is not None

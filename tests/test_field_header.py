@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C c
 
 def build(source: Path, target: Path, *options: str, compiler: str = "gcc") -> Path:
     command = [compiler, "-O2", *STRICT, *options, f"-I{get_include()}"]
-    language = ["-x", "c++" if compiler == "g++" else "c"]
+    language = ["-x", "c++" if "++" in compiler else "c"]
     subprocess.run([*command, *language, str(source), "-o", str(target), "-lm"], check=True)
     return target
 
@@ -70,6 +70,16 @@ def test_compiles_without_a_warning(tmp_path, compiler, standard, source):
     if shutil.which(compiler) is None:
         pytest.skip(f"needs {compiler}")
     build(source, tmp_path / "program", standard, compiler=compiler)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "g++", "clang++"])
+def test_a_robots_strict_build_takes_the_headers(tmp_path, compiler):
+    """What ROS 2 packages ask for; clang++ tells more conversions than the others."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}")
+    strict = ["-Wconversion", "-Wshadow", "-std=c++17" if "++" in compiler else "-std=c99"]
+    server = EXAMPLE.with_name("server.c")
+    build(server, tmp_path / "program", *strict, compiler=compiler)
 
 
 def test_a_million_answers_are_pythons(path, program):
@@ -344,6 +354,22 @@ def test_any_description_is_survived(path, watched, tmp_path):
         done = run(watched, folder, given=np.zeros(4).tobytes())
         assert 0 <= done.returncode < 9
         assert done.stderr == b""
+
+
+def test_a_force_that_python_rounds_to_the_devices_is_taken(path, program, tmp_path):
+    def round_up(folder):
+        content = json.loads((folder / "zarr.json").read_text())
+        for fixture in content["attributes"]["beatfield"]["fixtures"].values():
+            fixture["f_max_n"] = fixture["device_limits"]["force_n"] * (1 + 1e-10)
+            fixture["delta_mm"] = 20.0
+        (folder / "zarr.json").write_text(json.dumps(content))
+        (folder / "manifest.json").unlink()
+        write_manifest(folder)
+
+    other = damaged(path, tmp_path / "f.zarr", round_up)
+    force_n = np.linalg.norm(ForceField.open(other).force_at(25.0, 5, 3, 0.4, "stay_in"))
+    assert force_n > 0
+    assert run(program, other, given=np.array([10.0, 5, 3, 0.4]).tobytes()).returncode == 0
 
 
 def test_metadata_is_understood_whatever_the_order_of_its_keys(path, program, tmp_path):

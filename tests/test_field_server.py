@@ -16,7 +16,7 @@ from pipeline.errors import InputError
 from pipeline.field import ForceField, files, get_include
 from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
-from pipeline.field.tool import Needle
+from pipeline.field.tool import Needle, Polyline, outside_share
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 
@@ -278,3 +278,29 @@ def test_other_declarations_are_left_to_the_program(tmp_path, standard):
 def test_of_any_phase_only_the_fraction_counts(path, phase):
     field = ForceField.open(path)
     assert field.force_at(9.0, 4.0, 2.0, phase) == field.force_at(9.0, 4.0, 2.0, 0.0)
+
+
+def test_both_languages_tell_the_same_share_outside_the_grid(path, program):
+    """Of a bent line, the same line closed, and its first point alone; in poses of all kinds."""
+    corners = ((0.0, 0, 0), (5, 0, 0), (5, 40, 0), (5, 40, -70))
+    tools = [
+        Polyline(shape="polyline", points_mm=points, closed=closed)
+        for points, closed in ((corners, False), (corners, True), (corners[:1], True))
+    ]
+    rng, field, poses = np.random.default_rng(3), ForceField.open(path), []
+    for number in range(60):
+        pose = np.eye(4)
+        if number % 3:
+            pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform(-70, 70, 3)
+        poses.append(pose)
+    poses[0][:3, 3] = field.grid.upper_mm
+    poses[3][:3, 3] = field.grid.upper_mm + 1e-9
+    given = " ".join(repr(float(value)) for value in np.ravel(poses)).encode()
+    found = np.array(run(program, path, "outside", given=given).stdout.split(), float)
+    known = [outside_share(field.grid, tool, pose) for pose in poses for tool in tools]
+    np.testing.assert_allclose(found, known, rtol=0, atol=1e-12)
+    assert found.min() == 0
+    assert found.max() == 1
+    nothing = " ".join(["nan"] * 16).encode()
+    assert run(program, path, "outside", given=nothing).stdout.split() == [b"1", b"1", b"1"]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import InputError
 from pipeline.field import ForceField, get_include
 from pipeline.field.manifest import write_manifest
-from pipeline.field.tool import Needle, Polyline, read_tool, spread_points
+from pipeline.field.tool import Needle, Polyline, outside_share, read_tool, spread_points
 
 ROOT = Path(__file__).parent.parent
 TOOLS = sorted((ROOT / "configs" / "tools").glob("*.yaml"))
@@ -154,6 +154,34 @@ def test_wrong_questions_about_tools_are_refused(field, tmp_path):
         field.tool_force(tool, np.eye(4), 0.1, "none")
 
 
+@pytest.mark.parametrize("path", TOOLS, ids=lambda path: path.stem)
+def test_the_share_outside_the_grid_is_that_of_its_points(field, path):
+    tool = read_tool(path)
+    lines = tool.lines_mm()
+    points = np.concatenate(lines) if len(lines[0]) == 1 else points_along(lines, 20_000)
+    shares = []
+    for pose, _ in poses(30):
+        pose[:3, 3] *= 3.0
+        inside = field.contains(points @ pose[:3, :3].T + pose[:3, 3])
+        shares.append(outside_share(field.grid, tool, pose))
+        # Each crossing of a face is seen to a point; a circle's corners cross it more than once.
+        assert shares[-1] == pytest.approx(1 - inside.mean(), abs=1e-3)
+    assert min(shares) < 0.5 < max(shares)
+
+
+def test_a_tool_along_a_face_of_the_grid_is_inside(field):
+    """Where a piece does not move along an axis there is nothing to divide by."""
+    along_x, pose = Polyline(shape="polyline", points_mm=((0, 0, 0), (1, 0, 0))), np.eye(4)
+    pose[:3, 3] = field.grid.origin_mm
+    assert outside_share(field.grid, along_x, pose) == 0
+    pose[1, 3] -= 1e-6
+    assert outside_share(field.grid, along_x, pose) == 1
+    still = Polyline(shape="polyline", points_mm=((0, 0, 0), (0, 0, 0)), closed=True)
+    assert outside_share(field.grid, still, pose) == 1
+    with pytest.raises(InputError, match="mr_from_tool"):
+        outside_share(field.grid, still, 2 * np.eye(4))
+
+
 def test_a_tool_in_a_damaged_field_is_told_so(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "f.zarr")
     damaged = ForceField.open(tmp_path / "f.zarr")
@@ -206,7 +234,7 @@ def test_the_pages_lines_of_c_are_a_program(folder, field, tmp_path, language):
     (place / "field.zarr/zarr.json").write_text(json.dumps(about))
     (place / "field.zarr/manifest.json").unlink()
     write_manifest(place / "field.zarr")
-    needle = Needle(shape="needle", length_mm=150, handle_mm=(0, 0, 150))
+    needle = Needle(shape="needle", length_mm=10, handle_mm=(0, 0, 150))
     for x_mm in (4.0, 500.0):
         point_mm, pose = np.array([x_mm, -3.5, 16.25]), np.eye(4)
         tip_mm = (np.linalg.inv(mr_from_tracker) @ [*point_mm, 1])[:3]

@@ -5,13 +5,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.imaging.alignment import slice_shifts_mm
+from pipeline.imaging.alignment import _observations, slice_shifts_mm
 from pipeline.imaging.interpolation import (
     BAND_MM,
     REFINE,
     isotropic_labels,
     plane_depth_mm,
 )
+from pipeline.imaging.labels import LABELS
 
 PIXEL_MM = 1.5
 SIDE = 64
@@ -217,6 +218,18 @@ def test_shifted_planes_give_the_volume_of_unshifted_ones():
     )
 
 
+@pytest.mark.parametrize("shift_mm", [0.0, 6.0])
+def test_a_body_is_the_same_without_a_margin_around_it(shift_mm):
+    x, y = in_plane_mm()
+    disc = stack_of(np.stack([soft(12 - np.hypot(x - shift_mm, y))] * 6))
+    plane_mm, shifts_mm = STEP_MM * np.arange(6), np.tile([shift_mm, 0.0], (6, 1))
+    wide, none = (
+        isotropic_labels(disc, PIXEL_MM, plane_mm, shifts_mm, 2.0, PIXEL_MM, margin_mm)[0]
+        for margin_mm in (20.0, 0.0)
+    )
+    assert (none > 0).sum() == (wide > 0).sum()
+
+
 def tilted_heart(shifts_mm, phases=2):
     """Cone-like bodies about a slanting axis, as labels 1 and 2, displaced slice by slice."""
     x, y = in_plane_mm()
@@ -233,6 +246,27 @@ def without_trend(shifts_mm):
     k = np.arange(len(shifts_mm))
     basis = np.stack([np.ones_like(k), k], axis=1).astype(float)
     return shifts_mm - basis @ np.linalg.lstsq(basis, shifts_mm, rcond=None)[0]
+
+
+def test_slices_unevenly_spaced_are_told_what_their_shifts_make_of_a_curved_axis():
+    """An axis that is a parabola in height bends as much everywhere, in deviations."""
+    x, y = in_plane_mm()
+    heights_mm = np.array([0.0, 10, 20, 40, 50, 70, 80, 90])
+    shifts_mm = np.random.default_rng(2).normal(0, 1.5, (len(heights_mm), 2))
+
+    def observed(curvature, moved_mm):
+        axis_mm = 0.3 * (heights_mm - 45) + curvature / 2 * (heights_mm - 45) ** 2
+        places = zip(axis_mm + moved_mm[:, 0], moved_mm[:, 1], strict=True)
+        labels = np.stack([np.hypot(x - dx, y - dy) < 20 for dx, dy in places]).astype(np.uint8)
+        return _observations(labels[None] * LABELS["right_atrium"], PIXEL_MM, heights_mm)
+
+    still = observed(0.005, 0 * shifts_mm)
+    in_deviations = still.offsets_mm[:, 0] * np.sqrt(still.precision[:, 0, 0])
+    # A bend is half the curvature times both parts of the chord, which 10 mm each make 0.25 mm;
+    # a disc's centre on a lattice is known to some tenth of a pixel.
+    np.testing.assert_allclose(in_deviations, -0.25 / 1.5, atol=0.15 * PIXEL_MM / 1.5)
+    moved = observed(0.0, shifts_mm)
+    np.testing.assert_allclose(moved.matrix @ shifts_mm, moved.offsets_mm, atol=0.15 * PIXEL_MM)
 
 
 def test_breath_hold_jumps_are_found_and_tilt_is_left_alone():

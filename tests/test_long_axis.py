@@ -15,7 +15,15 @@ from pipeline.errors import InputError
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
-from pipeline.imaging.long_axis import NO_CROSSINGS, find_crossings
+from pipeline.imaging.long_axis import (
+    INDEPENDENT,
+    NO_CROSSINGS,
+    PLACE_MM,
+    SEARCH_MM,
+    _at_phases,
+    _peak,
+    find_crossings,
+)
 from pipeline.imaging.nifti import read_nifti_views, write_image
 from pipeline.imaging.view import PIXEL_MM, view_of
 from pipeline.products import read_long_axis, write_cine
@@ -58,6 +66,17 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     assert view.rr_s == 1.0
     np.testing.assert_allclose(view.mr_from_index[:3, 0], [0, 1.25, 0], atol=1e-9)
     assert len(stack.left_out) == 5
+
+
+def test_a_view_is_timed_by_what_tells_its_images_apart(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    for phase in range(PHASES):
+        data = in_series(dicom_frame(0, phase), 50, "view")
+        data.ImageOrientationPatient, data.TriggerTime = ACROSS, 0
+        data.ActualCardiacTriggerDelayTime = 100.0 * phase
+        data.save_as(tmp_path / f"view_{phase}.dcm")
+    _, (view,) = read_dicom_study(tmp_path)
+    np.testing.assert_allclose(view.cine.phases, 100 * np.arange(PHASES) / RR_MS)
 
 
 @pytest.mark.parametrize("digits", [4, 5, 6])
@@ -228,6 +247,29 @@ def test_crossings_tell_how_far_a_slice_lies_from_a_view() -> None:
     # Linear interpolation on 2 mm pixels and steps of 1 mm: the peak of smooth values lies within
     # half a step of a parabola's; both images are blurred alike.
     assert np.sqrt(np.square(error_mm).mean()) < 0.5
+
+
+def test_views_are_seen_at_the_stacks_phases_across_the_end_of_the_beat() -> None:
+    brightness = np.array([10.0, 40.0, 20.0], np.float32)
+    pixels = brightness[:, None, None, None] * np.ones((1, 2, 2), np.float32)
+    view = Cine(pixels, np.eye(4), np.array([0.1, 0.4, 0.8]), 0.8)
+    found = _at_phases(view, np.array([0.0, 0.1, 0.25, 0.9]))[:, 0, 0]
+    # From 0.8 to 1.1 it falls from 20 to 10.
+    np.testing.assert_allclose(found, [20 - 20 / 3, 10, 25, 20 - 10 / 3], rtol=1e-6)
+
+
+def test_the_place_of_best_agreement_is_found_between_the_places_tried() -> None:
+    """Where the likelihood is a parabola, place and precision are those of the parabola."""
+    y, x = np.mgrid[-SEARCH_MM : SEARCH_MM + 1, -SEARCH_MM : SEARCH_MM + 1]
+    off = np.stack([x - 2.3, y + 4.4], axis=-1)
+    bend = np.array([[3.0, 0.8], [0.8, 1.5]])
+    fall = np.einsum("...i,ij,...j->...", off, bend, off) / 2
+    agreement = np.sqrt(np.clip(1 - np.exp((fall - 30) / (INDEPENDENT / 2)), 0, 1))
+    found = _peak(agreement)
+    assert found is not None
+    np.testing.assert_allclose(found[0], [2.3, -4.4], atol=1e-6)
+    covariance = np.linalg.inv(bend) + PLACE_MM**2 * np.eye(2)
+    np.testing.assert_allclose(found[1], np.linalg.inv(covariance), rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

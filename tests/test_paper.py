@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,15 +13,18 @@ from field_baked import RADII_MM, RR_S
 from field_shapes import beating, sphere
 
 from pipeline.cli import main
+from pipeline.errors import InputError
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import bake_field
 from pipeline.paper import robustness
+from pipeline.paper.constrained_motion import _shown
 from pipeline.paper.dissection import clock, rows_of
 from pipeline.paper.laws import slopes
 from pipeline.paper.reader_time import percentiles_us
 from pipeline.paper.subject import open_subject
 from pipeline.paper.torus_tool import frame_about, ring
 from pipeline.paper.write import EXPERIMENTS
+from pipeline.products import FrameRow, write_frames
 
 FIXTURE = Fixture(structure="epicardium", kind="guidance", gamma_mm=2.5, m=2, f_max_n=2.0)
 
@@ -133,6 +137,18 @@ def test_rows_without_force_stand_before_those_that_are_compared_with_them():
         assert (free.tool, free.beating) == (row.condition.tool, row.condition.beating)
         assert free.handle == row.condition.handle
     assert {row.condition.tool for row in rows} == {"point", "needle", "torus"}
+
+
+def test_a_sweep_without_frames_that_bear_the_registration_out_is_not_shown(tmp_path):
+    sweeps = [SimpleNamespace(name="first"), SimpleNamespace(name="second")]
+    rows = [FrameRow(one, n, 0.1 * n, 0.1, 0.5, one == "second") for one in ("first", "second")
+            for n in range(3)]  # fmt: skip
+    write_frames(tmp_path / "frames.csv", rows)
+    sweep, shown = _shown(sweeps, tmp_path / "frames.csv")
+    assert sweep.name == "second"
+    assert [row.frame for row in shown] == [0, 1, 2]
+    with pytest.raises(InputError, match="no sweep has two frames"):
+        _shown(sweeps[:1], tmp_path / "frames.csv")
 
 
 def test_times_are_written_as_in_the_paper():

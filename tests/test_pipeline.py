@@ -143,6 +143,11 @@ def test_registration_ends_within_three_millimetres_from_ten_off(products: Path)
     assert metrics["frame_phase_error"]["largest"] < 0.05
 
 
+def test_the_field_says_what_its_registration_is_worth(products: Path) -> None:
+    told = ForceField.open(products / "bake" / "field.zarr").source["registration"]
+    assert told["verdict"] in ("good", "doubtful")
+
+
 def at_stored_phase(store: Path, structure: str, phase: int, shape: tuple[int, ...]) -> Float:
     """Coefficients ``(z, y, x)`` at a stored phase: 1/8, 6/8 and 1/8 of three phases'."""
     chunks = store / "spline" / structure / "c"

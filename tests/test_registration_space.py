@@ -259,7 +259,8 @@ class TestRefusals:
     def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
         sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))
         monkeypatch.setattr(stage, "read_sweeps", lambda _: [sweep])
-        monkeypatch.setattr(stage, "_r_times_s", lambda _: None)
+        monkeypatch.setattr(stage, "_ecg", lambda _: None)
+        monkeypatch.setattr(stage, "_r_times_s", lambda *_: None)
         timing = SimpleNamespace(phases=lambda: [np.zeros(4)])
         monkeypatch.setattr(stage, "_timing", lambda *_: timing)
         study = SimpleNamespace(us=SimpleNamespace(sweeps=("a",)))

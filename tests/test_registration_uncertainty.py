@@ -21,7 +21,7 @@ from pipeline.registration.uncertainty import (
     motion_between,
     sandwich,
 )
-from pipeline.registration.verdict import Evidence, judge
+from pipeline.registration.verdict import Evidence, judge, outvoted
 
 PIVOT = Pivot(np.array([10.0, -20.0, 30.0]), 40.0)
 BENDING = np.diag([2.0, 3.0, 1.0, 1.5, 0.5, 4.0]) + 0.2
@@ -195,6 +195,7 @@ class TestVerdict:
             ({"confidence": 1.7}, "1.70 times"),
             ({"rival": 0.8}, "to 80%"),
             ({"valid": 20}, "20 of 48"),
+            ({"outvoted": (2,)}, "hardly any frame of sweep 2 bears out"),
         ],
     )
     def test_each_weakness_makes_it_doubtful_and_is_named(self, change, reason):
@@ -218,6 +219,16 @@ class TestVerdict:
         verdict = judge(Evidence(**(SOUND | change)), RegisterSettings())
         assert verdict.grade == "failed"
         assert reason in verdict.reason
+
+    @pytest.mark.parametrize(
+        ("borne_out", "named"),
+        [((20, 0), (2,)), ((20, 2), (2,)), ((20, 3), ()), ((9, 0), ()), ((20, 20), ())],
+    )
+    def test_a_sweep_that_contradicts_the_other_is_outvoted(self, borne_out, named):
+        """As one whose calibration is another's: both cannot be right, and a pose says nothing."""
+        sweep = np.repeat([0, 1, 2], [20, 20, 4])
+        bears_out = np.concatenate([np.arange(20) < count for count in borne_out] + [np.zeros(4)])
+        assert outvoted(sweep, bears_out.astype(bool), least=10) == named
 
     def test_settings_refuse_bounds_that_cross(self):
         with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from io import BytesIO
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
 from PIL import Image
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.labels import LABELS
-from pipeline.report import certificate, curves, heart, slices
+from pipeline.report import certificate, curves, heart, pictures, slices
 from pipeline.report.animation import HEAD, ROOM, TOWARDS_VIEWER, even_in_time, framing
 from pipeline.report.colours import STYLES
 from pipeline.report.moments import MARGIN_PIXELS, Moments
@@ -287,6 +289,36 @@ def test_what_cannot_be_shown_is_left_out(monkeypatch: pytest.MonkeyPatch) -> No
     ]
 
 
+def test_a_stack_without_a_right_ventricle_has_no_figures_of_one() -> None:
+    known = measures(4)
+    del known["volumes_ml"]["rv_endocardium"]
+    assert [name for name, _ in heart.function_rows(known)] == [
+        "LV volume, largest / smallest",
+        "LV ejection fraction",
+        "LV mass",
+    ]
+
+
+@pytest.mark.parametrize("tall", [1.0, 2.5])
+def test_arrows_of_force_point_along_it_whatever_the_pixels(tall: float) -> None:
+    """A plane's normal leans by 30 degrees down from the columns' direction, and attracts."""
+    lean = np.radians(30)
+    normal = np.array([np.cos(lean), np.sin(lean), 0.0])
+    field: Any = SimpleNamespace(
+        fixtures={"a": SimpleNamespace(structure="plane", f_max_n=1.0)},
+        potential=lambda points, phase, fixture: np.full(len(points), 0.5),
+        distance_mm=lambda points, phase, structure: (points - 40.0) @ normal,
+        force_n=lambda points, phase, fixture: np.tile(normal, (len(points), 1)),
+    )
+    shown = replace(moments(3), mr_from_index=np.diag([1.0, tall, 8.0, 1.0]))
+    figure = pictures.potential_on_slice(shown, field, "a")
+    drawn(figure)
+    (arrows,) = (one for one in figure.axes[0].collections if isinstance(one, Quiver))
+    arrow = np.asarray(arrows.get_paths()[0].vertices)
+    tip = arrow[np.linalg.norm(arrow, axis=1).argmax()]
+    assert np.degrees(np.arctan2(tip[1], tip[0])) == pytest.approx(-30, abs=0.1)
+
+
 def test_pictures_repeat_to_the_byte() -> None:
     def made() -> list[bytes]:
         figure = slices.contours(moments(3), 0, np.array([[0.9, 0.7, 0.8]]), 0.8)
@@ -297,6 +329,21 @@ def test_pictures_repeat_to_the_byte() -> None:
     assert first == second
     assert Image.open(BytesIO(first[0])).format == "WEBP"
     assert b"Matplotlib" not in first[1]
+
+
+def test_pieces_of_a_cut_are_joined_so_that_dashes_show() -> None:
+    angles = np.linspace(0, 2 * np.pi, 41)
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    bow = np.column_stack([np.arange(8.0), np.arange(8.0) ** 2]) + 5
+    pieces = np.concatenate([np.stack([one[:-1], one[1:]], axis=1) for one in (ring, bow)])
+    pieces = np.random.default_rng(3).permutation(pieces)
+    pieces[::2] = pieces[::2, ::-1]
+    found = sorted(pictures.joined(pieces), key=len)
+    assert [len(one) for one in found] == [8, 41]
+    np.testing.assert_allclose(sorted(found[0].tolist()), sorted(bow.tolist()), atol=1e-6)
+    np.testing.assert_array_equal(found[1][0], found[1][-1])
+    assert np.linalg.norm(np.diff(found[1], axis=0), axis=1).max() < 0.16
+    assert pictures.joined(np.zeros((0, 2, 2))) == []
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,27 @@ def test_a_changed_input_runs_all_that_follows_from_it(kitchen: Kitchen) -> None
     assert kitchen.text("c") == "c(a(other),b(a(other)))"
 
 
+def test_what_a_stage_noticed_counts_for_those_that_repeat_it(kitchen: Kitchen) -> None:
+    """A header that now says where the images lie changes no image."""
+    noticed = {"remarks": ["nowhere"]}
+
+    def first(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text("the same images")
+        return dict(noticed)
+
+    def last(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text(" ".join(job.figures("a")["remarks"]))
+        return {}
+
+    kitchen.bodies |= {"a": first, "c": last}
+    kitchen.run()
+    assert kitchen.text("c") == "nowhere"
+    (kitchen.folder / "cine" / "image").write_text("mended header")
+    noticed["remarks"] = ["all is well"]
+    kitchen.run()
+    assert kitchen.text("c") == "all is well"
+
+
 def test_a_changed_setting_runs_only_the_stages_that_read_it(kitchen: Kitchen) -> None:
     kitchen.run()
     changed = Settings.model_validate({"bake": {"spacing_mm": 3.0}})
@@ -214,6 +235,22 @@ def test_a_skipped_stage_says_why_and_removes_what_it_once_made(kitchen: Kitchen
     assert (skipped["status"], skipped["cause"]) == ("skipped", "no ultrasound")
     assert kitchen.record()["stages"]["c"]["figures"] == {"without b": True}
     assert not (kitchen.out / "p1" / "b").exists()
+
+
+def test_a_stage_that_was_skipped_is_not_tried_again_until_something_changes(
+    kitchen: Kitchen,
+) -> None:
+    def skip(job: Job) -> dict[str, Any]:
+        raise Skipped("no ultrasound")
+
+    kitchen.bodies |= {"b": skip, "c": lambda job: {}}
+    kitchen.run()
+    assert kitchen.run() == {"a": "unchanged", "b": "skipped: no ultrasound", "c": "unchanged"}
+    assert kitchen.calls == []
+    kitchen.run(first="b")
+    assert kitchen.calls == ["b", "c"]
+    kitchen.run(Settings.model_validate({"bake": {"spacing_mm": 2.5}}))
+    assert kitchen.calls == ["b"]
 
 
 def test_a_folder_that_a_system_will_not_make_is_named_and_a_lost_input_is_not_taken_for_one(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from kitchen import Kitchen
 
+from pipeline import run as runner
 from pipeline.config import Settings
-from pipeline.errors import StageError
+from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
 
 CHANGED = Settings.model_validate({"bake": {"spacing_mm": 3.0}})
@@ -39,6 +41,17 @@ def test_what_is_made_from_a_stale_product_is_stale(kitchen: Kitchen) -> None:
     kitchen.run(last="a")
     assert statuses(kitchen) == dict.fromkeys("abc", "done")
     assert kitchen.record()["stages"]["c"]["seconds"] is not None
+
+
+def test_nothing_is_made_of_a_product_that_was_altered(kitchen: Kitchen) -> None:
+    """Of the same size: a digit of a transform, say. Its digest is what later stages trust."""
+    kitchen.run()
+    text = kitchen.out / "p1" / "a" / "text"
+    text.write_text(text.read_text().replace("first", "f1rst"))
+    with pytest.raises(InputError, match=r"a/text: is not what the stage a wrote.*--from a"):
+        kitchen.run(first="b")
+    assert kitchen.run(first="a") == dict.fromkeys("abc", "done")
+    assert kitchen.text("c") == "c(a(first),b(a(first)))"
 
 
 def test_an_interrupted_run_tells_of_older_products(kitchen: Kitchen) -> None:
@@ -103,3 +116,11 @@ def test_a_skipped_stage_is_not_forgotten_while_it_would_be_skipped_again(
     # With other settings it may have something to do, and c would then be made from that.
     kitchen.run(CHANGED, last="a")
     assert statuses(kitchen) == {"a": "done", "c": "stale"}
+
+
+@pytest.mark.parametrize("stage", runner.STAGES, ids=lambda stage: stage.name)
+def test_a_stage_reads_no_product_that_it_is_not_made_from(stage: runner.Stage) -> None:
+    """Else it would stand when that changes: a registration to another beat, for one."""
+    text = (Path(runner.__file__).parent / "stages" / f"{stage.name}.py").read_text()
+    used = re.findall(r'products / "(\w+)"|job\.(?:product|figures)\("(\w+)"\)', text)
+    assert {one or other for one, other in used} <= set(stage.after)

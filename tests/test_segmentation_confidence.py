@@ -273,6 +273,13 @@ def test_a_stack_that_ends_too_soon_is_known_by_its_last_cuts(radii, found):
     assert cut_off(both) == found | others
 
 
+@pytest.mark.parametrize(("count", "step"), [(3, 2), (2, 4), (5, 2)])
+def test_a_slice_without_neighbours_is_not_unlike_them(count, step):
+    """Three slices 5 mm apart: those 9 mm away from the middle one are not there."""
+    heart = np.ones((2, count, 6, 6), bool)
+    np.testing.assert_array_equal(confidence._best_overlap_in_space(heart, step), 1)
+
+
 @pytest.mark.parametrize(
     ("right", "atria", "refused"),
     [(0, 900, True), (60, 900, True), (400, 900, False), (0, 0, False)],

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from surface_shapes import SPACING_MM, MovingBody, ellipsoid, voxel_centres, voxel_noise_mm
 
 from pipeline.errors import InputError, StageError
-from pipeline.evaluation.metrics import closedness, volumes_ml
+from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Float, Label, MovingSurface, transform_points
 from pipeline.imaging.labels import LABELS
 from pipeline.surface.extraction import STRUCTURES, extract
+from pipeline.surface.measures import volumes_ml
 from pipeline.surface.settings import SurfaceSettings
 
 PHASES = np.array([0.0, 0.15, 0.35, 0.5, 0.7, 0.85])

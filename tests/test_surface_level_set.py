@@ -52,6 +52,27 @@ def test_zero_level_of_a_ball_is_unbiased_at_any_curvature(radius, offset):
     assert error.std() < 1.5 * noise
 
 
+def test_a_rim_is_moved_no_more_than_a_flat_side():
+    """The constant that keeps the volume brings a ball back, but no body of several curvatures.
+
+    Plain smoothing moves the rim of a lens inwards by s^2 times its mean curvature, its flat sides
+    by s^2 times theirs; of the difference more than half must go.
+    """
+    wide, high, s = 20.0, 8.0, 1.5
+    way = np.random.default_rng(0).normal(size=(6000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    rim, flat = np.abs(way[:, 2]) < 0.1, np.abs(way[:, 2]) > 0.95
+    found = []
+    # Where a flat side lies among the voxels decides more than its curvature.
+    for middle in 24 + np.arange(4) / 4:
+        z, y, x = np.indices((49, 65, 65)) - np.array([middle, 32, 32])[:, None, None, None]
+        level = smooth_level_set((x**2 + y**2) / wide**2 + z**2 / high**2 < 1, 1.0, s)
+        off = level.sample(way * (wide, wide, high) + (32, 32, middle))[0]
+        found.append(off[rim].mean() - off[flat].mean())
+    plain = s**2 * ((wide / high**2 + 1 / wide) / 2 - high / wide**2)
+    assert abs(np.mean(found)) < plain / 2
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.floats(5, 14), offsets)
 def test_zero_level_encloses_the_volume_of_the_voxels(radius, offset):

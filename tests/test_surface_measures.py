@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.surface.crossings import crossing_triangles
-from pipeline.surface.measures import MUSCLE_G_ML, ejection_fraction, measures
+from pipeline.surface.measures import MUSCLE_G_ML, ejection_fraction, end_systole, measures
 
 PHASES = np.array([0.0, 0.4])
 INNER_MM, OUTER_MM = (25.0, 20.0), (33.0, 31.0)
@@ -163,3 +163,13 @@ def test_the_shapes_of_these_tests_are_sound():
 
 def test_ejection_is_nothing_for_a_still_heart():
     assert ejection_fraction(np.array([100.0, 100.0])) == 0.0
+
+
+@pytest.mark.parametrize("begins", [0.0, 0.3, 0.9])
+def test_end_of_systole_is_found_wherever_the_phases_begin(begins: float) -> None:
+    phases = np.arange(25) / 25
+    since_r = (phases + begins) % 1
+    volume_ml = 120 - 70 * np.exp(-(((since_r - 0.42) / 0.15) ** 2))
+    noisy_ml = volume_ml + np.random.default_rng(3).normal(0, 1.5, 25)
+    apart = (end_systole(phases, noisy_ml) - (0.42 - begins) + 0.5) % 1 - 0.5
+    assert abs(apart) < 0.03

@@ -205,3 +205,27 @@ def test_a_mesh_file_that_is_cut_off_is_refused(
     with pytest.raises(InputError, match=r"cut\.\w+: is (cut off|no whole)"):
         read_mesh(cut)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("ending", [".vtp", ".ply"])
+def test_what_is_no_surface_is_left_out(tmp_path: Path, ending: str) -> None:
+    """Points that no triangle names, and triangles that are lines: both would bend a field."""
+    ball = pyvista.Sphere(radius=5.0)
+    faces = np.asarray(ball.regular_faces)
+    points = np.vstack([[0.0, 0, 0], ball.points, [90.0, 0, 0]])
+    lines = [[1, 1, 200], [7, 300, 7]]
+    mesh = pyvista.PolyData.from_regular_faces(points, np.vstack([faces + 1, lines]))
+    mesh.save(tmp_path / f"ball{ending}")
+
+    found = read_mesh(tmp_path / f"ball{ending}")
+
+    np.testing.assert_allclose(found.vertices_mm, ball.points, atol=1e-6)
+    np.testing.assert_array_equal(found.triangles, faces)
+
+
+def test_triangles_of_vertices_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    pyvista.Sphere().save(tmp_path / "ball.ply", binary=False)
+    text = (tmp_path / "ball.ply").read_text().rstrip()
+    (tmp_path / "ball.ply").write_text(f"{text.rpartition(chr(10))[0]}\n3 0 1 842\n")
+    with pytest.raises(InputError, match="name vertices 0 to 842, there are 842"):
+        read_mesh(tmp_path / "ball.ply")

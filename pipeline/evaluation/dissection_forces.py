@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from pipeline.evaluation.compiled import inner
 from pipeline.evaluation.dissection_values import ENERGY_STEP_MM
 from pipeline.field import kernels
 from pipeline.field.tool_kernels import tool_force
 
-INNER = kernels.INNER
 _spline_at, _felt_at = kernels.spline_at, kernels.felt_at
 
 
-@njit(**INNER)
+@inner
 def _stored(guide, distance_mm):  # type: ignore[no-untyped-def]
     """Energy that the fixture holds at a distance from its surface, mJ."""
     side = guide.law[3]
@@ -34,7 +32,7 @@ def _stored(guide, distance_mm):  # type: ignore[no-untyped-def]
     return one + share * (two - one) - share * (1.0 - share) * bend
 
 
-@njit(**INNER)
+@inner
 def nearest(law, shape, pose, phase):  # type: ignore[no-untyped-def]
     """Least distance of the tool's points from the lifted surface."""
     least = math.inf
@@ -45,7 +43,7 @@ def nearest(law, shape, pose, phase):  # type: ignore[no-untyped-def]
     return least
 
 
-@njit(**INNER)
+@inner
 def _placed(points_mm, n, pose):  # type: ignore[no-untyped-def]
     a, b, c = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
     return (
@@ -55,7 +53,7 @@ def _placed(points_mm, n, pose):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(**INNER)
+@inner
 def energy(guide, shape, pose, phase):  # type: ignore[no-untyped-def]
     """Energy that the fixture holds with the tool there: the mean over its points."""
     total = 0.0
@@ -68,7 +66,7 @@ def energy(guide, shape, pose, phase):  # type: ignore[no-untyped-def]
     return total / count
 
 
-@njit(**INNER)
+@inner
 def force_on(guide, shape, tip, pose, phase, room):  # type: ignore[no-untyped-def]
     """Force of the fixture on the tool, three newtons at the tip."""
     phase += guide.lag

@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from pipeline.evaluation import dissection_forces, rod
+from pipeline.evaluation.compiled import asked, inner
 from pipeline.evaluation.dissection_values import MINDS, SUMS, Mind, Sum
 from pipeline.evaluation.operators import EFFECTIVE_WIDTH
 from pipeline.field import kernels
 
-ASKED, INNER = kernels.ASKED, kernels.INNER
 _spline_at = kernels.spline_at
 _nearest, _energy = dissection_forces.nearest, dissection_forces.energy
 _force_on = dissection_forces.force_on
@@ -39,7 +38,7 @@ DECIDED, ALARMED, MOVING = 0.0, 1.0, 2.0
 NOTHING, GONE, TOUCHED, AT_WORK = 0, 1, 2, 3
 
 
-@njit(**INNER)
+@inner
 def pellet_at(task, number, phase, place):  # type: ignore[no-untyped-def]
     """Where a pellet is, into three numbers; straight between the moments of the beat."""
     moments = task.pellets_mm.shape[1]
@@ -53,7 +52,7 @@ def pellet_at(task, number, phase, place):  # type: ignore[no-untyped-def]
         place[k] = one + share * (two - one)
 
 
-@njit(**INNER)
+@inner
 def _look(task, person, mind, draws, plan, tip, phase, time, aim):  # type: ignore[no-untyped-def]
     """See pellet and tip; where to go is ``aim``, and when is later by the delay.
 
@@ -79,7 +78,7 @@ def _look(task, person, mind, draws, plan, tip, phase, time, aim):  # type: igno
     mind[Mind.GO] = max(time + person.delay_s, mind[Mind.START] + mind[Mind.LASTS])
 
 
-@njit(**INNER)
+@inner
 def _set_out(task, person, mind, plan, aim, time):  # type: ignore[no-untyped-def]
     """Begin a movement of the hand towards where the tip is to go.
 
@@ -107,7 +106,7 @@ def _set_out(task, person, mind, plan, aim, time):  # type: ignore[no-untyped-de
     mind[Mind.LASTS] = max(person.slope_s_per_bit * bits, LEAST_MOVE_S)
 
 
-@njit(**INNER)
+@inner
 def _wish(mind, plan, waves, time, wish):  # type: ignore[no-untyped-def]
     """Where the hand wants to be: minimum jerk along the plan, and the tremor."""
     share = (time - mind[Mind.START]) / mind[Mind.LASTS]
@@ -122,7 +121,7 @@ def _wish(mind, plan, waves, time, wish):  # type: ignore[no-untyped-def]
         wish[k] = plan[0, k] + smooth * plan[1, k] + shaken
 
 
-@njit(**INNER)
+@inner
 def _move(person, handle, tick_s, hand, sums):  # type: ignore[no-untyped-def]
     """One tick of the handle; ``hand`` has rows place, speed, old wish, new wish, force held.
 
@@ -159,7 +158,7 @@ def _move(person, handle, tick_s, hand, sums):  # type: ignore[no-untyped-def]
     sums[Sum.WORST] = max(sums[Sum.WORST], abs(kinetic + spring - before - gained))
 
 
-@njit(**INNER)
+@inner
 def _watch(task, mind, tip, phase, clear_mm, place, sums):  # type: ignore[no-untyped-def]
     """Count contact, workspace and progress; what the operator must react to.
 
@@ -190,7 +189,7 @@ def _watch(task, mind, tip, phase, clear_mm, place, sums):  # type: ignore[no-un
     return news
 
 
-@njit(**INNER)
+@inner
 def _draw_back(task, plan, aim):  # type: ignore[no-untyped-def]
     """Aim up the rod, away from the heart."""
     x, y, z = _across(plan[0] + plan[1], task.pivot_mm, task.rod_mm)
@@ -199,7 +198,7 @@ def _draw_back(task, plan, aim):  # type: ignore[no-untyped-def]
     aim[0], aim[1], aim[2] = x + share * up[0], y + share * up[1], z + share * up[2]
 
 
-@njit(**INNER)
+@inner
 def _think(task, person, mind, draws, plan, tip, phase, time, news, aim, sums):  # type: ignore[no-untyped-def]
     """React to news; look, or begin a movement, when its time has come."""
     if news == GONE:
@@ -223,7 +222,7 @@ def _think(task, person, mind, draws, plan, tip, phase, time, news, aim, sums): 
     mind[Mind.GO] = mind[Mind.START] + mind[Mind.LASTS]
 
 
-@njit(**ASKED)
+@asked
 def dissect(task, guide, shape, person, handle, waves, draws, trace):  # type: ignore[no-untyped-def]
     """One trial of one operator.
 
@@ -281,7 +280,7 @@ def dissect(task, guide, shape, person, handle, waves, draws, trace):  # type: i
     return sums
 
 
-@njit(**INNER)
+@inner
 def _account(guide, shape, pose, phase, sums, source, worked):  # type: ignore[no-untyped-def]
     """Put down to a source what the fixture now holds more, and the work that it did meanwhile.
 
@@ -292,7 +291,7 @@ def _account(guide, shape, pose, phase, sums, source, worked):  # type: ignore[n
     sums[Sum.STORED] = stored
 
 
-@njit(**INNER)
+@inner
 def _begin(task, waves, mind, plan, hand, tip, pose):  # type: ignore[no-untyped-def]
     """The tip at rest at the start, the hand where it wants to be."""
     hx, hy, hz = _across(task.start_mm, task.pivot_mm, task.rod_mm)
@@ -304,7 +303,7 @@ def _begin(task, waves, mind, plan, hand, tip, pose):  # type: ignore[no-untyped
     _frame_of(tip, task.pivot_mm, pose)
 
 
-@njit(**INNER)
+@inner
 def _record(task, tick, mind, tip, clear_mm, force, trace):  # type: ignore[no-untyped-def]
     """Every 10 ms a row of the trace, while there are rows."""
     every = max(round(TRACE_S / task.tick_s), 1)
@@ -315,7 +314,7 @@ def _record(task, tick, mind, tip, clear_mm, force, trace):  # type: ignore[no-u
         row[5], row[6], row[7] = force[0], force[1], force[2]
 
 
-@njit(**INNER)
+@inner
 def _follow(task, guide, hand, tip, pose, phase, sums):  # type: ignore[no-untyped-def]
     """Bring the tip to where the handle is; count path, force and what lies outside."""
     size = math.sqrt(hand[4, 0] ** 2 + hand[4, 1] ** 2 + hand[4, 2] ** 2)

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_array, csgraph
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, MovingSurface, Surface, transform_points
+from pipeline.geometry import Float, Surface, transform_points
+from pipeline.surface.measures import distances_mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,30 +68,13 @@ def surface_distance(
     seed
         Of the sampling.
     """
-    there = np.abs(distances_mm(surface_samples(first, samples, seed), second))
-    back = np.abs(distances_mm(surface_samples(second, samples, seed), first))
+    there = distances_mm(surface_samples(first, samples, seed), second)
+    back = distances_mm(surface_samples(second, samples, seed), first)
     return SurfaceDistance(
         mean_mm=float(there.mean() + back.mean()) / 2,
         hausdorff95_mm=float(max(np.percentile(there, 95), np.percentile(back, 95))),
         largest_mm=float(max(there.max(), back.max())),
     )
-
-
-def distances_mm(points_mm: Float, surface: Surface) -> Float:
-    """Signed distance ``(n,)`` from points to the nearest point of a surface's triangles.
-
-    VTK's search over exact point-to-triangle distances; negative inside a closed, outward surface.
-    """
-    import pyvista
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkDoubleArray
-    from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-
-    distance = vtkImplicitPolyDataDistance()
-    distance.SetInput(pyvista.PolyData.from_regular_faces(surface.vertices_mm, surface.triangles))
-    values = vtkDoubleArray()
-    distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points_mm, np.float64)), values)
-    return np.array(vtk_to_numpy(values))
 
 
 def surface_samples(surface: Surface, count: int, seed: int = 0) -> Float:
@@ -195,18 +179,3 @@ def closedness(surface: Surface) -> Closedness:
         components=len(used),
         outward=bool((volume[used] > 0).all()),
     )
-
-
-def volumes_ml(moving: MovingSurface) -> Float:
-    """Enclosed volume ``(phase,)`` in ml."""
-    return np.array([moving.at(k).volume_mm3() / 1000 for k in range(len(moving.phases))])
-
-
-def emptying(volume_ml: Float) -> Float:
-    """Part of the largest volume that has left, ``(phase,)`` in [0, 1]: 1 - V / max V."""
-    return np.asarray(1 - volume_ml / volume_ml.max())
-
-
-def ejection_fraction(volume_ml: Float) -> float:
-    """Stroke volume over the largest volume, in [0, 1]."""
-    return float(emptying(volume_ml).max())

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Integer, MovingSurface, Surface
+from pipeline.surface.mesh import vertex_areas, vertex_normals
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ def motion_error(found: MovingSurface, truth: MovingSurface, reference: int = 0)
             f"{len(found.phases)} and {len(truth.phases)}"
         )
     corners, shares = material_points(found.vertices_mm[reference], truth.at(reference))
-    area = _vertex_areas(found.at(reference))
+    area = vertex_areas(found.vertices_mm[reference], found.triangles)
     start = _carried(truth.vertices_mm[reference], corners, shares)
     across, along = np.zeros((2, len(found.phases)))
     for number in range(len(found.phases)):
@@ -107,24 +108,6 @@ def _carried(values: Float, corners: Integer, shares: Float) -> Float:
 
 def _normals(surface: Surface, corners: Integer, shares: Float) -> Float:
     """Unit normals ``(n, 3)`` at material points, between the area-weighted ones of vertices."""
-    facets = _facets(surface)
-    at_vertex = np.zeros_like(surface.vertices_mm)
-    for column in range(3):
-        np.add.at(at_vertex, surface.triangles[:, column], facets)
-    at_vertex /= np.maximum(np.linalg.norm(at_vertex, axis=1, keepdims=True), 1e-12)
+    at_vertex = vertex_normals(surface.vertices_mm, surface.triangles)
     here = _carried(at_vertex, corners, shares)
     return np.asarray(here / np.maximum(np.linalg.norm(here, axis=1, keepdims=True), 1e-12))
-
-
-def _vertex_areas(surface: Surface) -> Float:
-    """A third of the area of the triangles around each vertex."""
-    third = np.linalg.norm(_facets(surface), axis=1) / 6
-    triangles = surface.triangles
-    whole = np.bincount(triangles.ravel(), np.repeat(third, 3), len(surface.vertices_mm))
-    return np.asarray(whole, np.float64)
-
-
-def _facets(surface: Surface) -> Float:
-    """Normals of the triangles, twice as long as their area."""
-    a, b, c = (surface.vertices_mm[surface.triangles[:, k]] for k in range(3))
-    return np.asarray(np.cross(b - a, c - a))

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-from pipeline.field.kernels import INNER
+from pipeline.evaluation.compiled import inner
 
 
-@njit(**INNER)
+@inner
 def across(point, pivot, length):  # type: ignore[no-untyped-def]
     """The other end of the rod, three numbers (mm), for one end beyond the pivot."""
     x, y, z = pivot[0] - point[0], pivot[1] - point[1], pivot[2] - point[2]
@@ -22,7 +20,7 @@ def across(point, pivot, length):  # type: ignore[no-untyped-def]
     return pivot[0] + share * x, pivot[1] + share * y, pivot[2] + share * z
 
 
-@njit(**INNER)
+@inner
 def at_the_handle(force, handle, pivot, length):  # type: ignore[no-untyped-def]
     """Force at the handle (N) that does the same work as one at the tip.
 
@@ -38,7 +36,7 @@ def at_the_handle(force, handle, pivot, length):  # type: ignore[no-untyped-def]
     return axial * x - lever * force[0], axial * y - lever * force[1], axial * z - lever * force[2]
 
 
-@njit(**INNER)
+@inner
 def frame_of(tip, pivot, pose):  # type: ignore[no-untyped-def]
     """Pose of a tool on the rod, into a 4x4: z from the tip up the shaft, x level with LPS y."""
     zx, zy, zz = pivot[0] - tip[0], pivot[1] - tip[1], pivot[2] - tip[2]

@@ -253,6 +253,7 @@ def _describe(name: str, moving: BeatingSurface) -> StructurePart:
         # Which edges are shared does not depend on where the vertices are.
         if index == 0 or surface.triangles is not each[index - 1].triangles:
             require_no_open_edge(surface, where)
+            _require_no_stray_vertex(surface, where)
         require_outward(surface, where)
     return StructurePart(
         path=f"distance/{name}",
@@ -260,6 +261,16 @@ def _describe(name: str, moving: BeatingSurface) -> StructurePart:
         triangles=[len(surface.triangles) for surface in each],
         volume_ml=[surface.volume_mm3() / 1000 for surface in each],
     )
+
+
+def _require_no_stray_vertex(surface: Surface, where: str) -> None:
+    """The fit would pull the field to zero there, and the certificate would ask for that zero."""
+    uses = np.bincount(surface.triangles.ravel(), minlength=len(surface.vertices_mm))
+    if not uses.all():
+        raise InputError(
+            f"{where}: {np.count_nonzero(uses == 0)} vertices belong to no triangle, the first is "
+            f"number {np.argmin(uses)}; leave them out"
+        )
 
 
 def _require_room(metadata: FieldMetadata, settings: BakeSettings) -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from pipeline.field import kernels
 from pipeline.geometry import Float
@@ -30,7 +29,7 @@ _MANY_LINES = 16
 
 _spline_at, _felt_at, _moment_of = kernels.spline_at, kernels.felt_at, kernels.moment_of
 _fetch = kernels.fetch
-_ASKED, _INNER = kernels.ASKED, kernels.INNER
+_asked, _inner = kernels.asked, kernels.inner
 
 
 def follow(points_mm: Float, phases: Float, grid: Float, phase_count: int) -> bool:
@@ -51,7 +50,7 @@ def follow(points_mm: Float, phases: Float, grid: Float, phase_count: int) -> bo
     return bool(far.sum() < _PAIRS // 4)
 
 
-@njit(**_ASKED)
+@_asked
 def sort(line, grid, points_mm, phases, bins, ends, notes):  # type: ignore[no-untyped-def]
     """Copy questions into notes, those of a bin after one another.
 
@@ -82,7 +81,7 @@ def sort(line, grid, points_mm, phases, bins, ends, notes):  # type: ignore[no-u
         notes[to, 3] = phases[n if len(phases) > 1 else 0]
 
 
-@njit(**_INNER)
+@_inner
 def _ahead(addresses, grid, ends, number):  # type: ignore[no-untyped-def]
     """Where the coefficients start and end that the bin after this asks for, but this does not.
 
@@ -98,7 +97,7 @@ def _ahead(addresses, grid, ends, number):  # type: ignore[no-untyped-def]
     return start + np.uintp(low * layer), start + np.uintp(high * layer)
 
 
-@njit(**_ASKED)
+@_asked
 def answer(addresses, line, grid, ends, notes):  # type: ignore[no-untyped-def]
     """Put distance and gradient in the place of the sorted questions in the notes."""
     n = 0
@@ -117,7 +116,7 @@ def answer(addresses, line, grid, ends, notes):  # type: ignore[no-untyped-def]
             n += 1
 
 
-@njit(**_ASKED)
+@_asked
 def answer_force(law, ends, notes):  # type: ignore[no-untyped-def]
     """Put the force (its distance behind it) in the place of the sorted questions."""
     n = 0
@@ -136,7 +135,7 @@ def answer_force(law, ends, notes):  # type: ignore[no-untyped-def]
             n += 1
 
 
-@njit(**_ASKED)
+@_asked
 def bring_back(bins, ends, notes, first, number, vector):  # type: ignore[no-untyped-def]
     """Copy answers back in the order of the questions.
 

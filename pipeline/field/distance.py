@@ -57,9 +57,11 @@ def require_no_open_edge(surface: Surface, where: str) -> None:
     """Raise InputError unless every edge belongs to two triangles of opposed direction."""
     edges = len(surface.boundary_edges())
     if edges:
+        twins = len(surface.vertices_mm) - len(np.unique(surface.vertices_mm, axis=0))
+        merge = f"merge the {twins} vertices that lie where others do, " if twins else ""
         raise InputError(
             f"{where}: is not closed, {edges} edges are not shared by two triangles of opposed "
-            "direction; close its holes and make its normals agree"
+            f"direction; {merge}close its holes and make its normals agree"
         )
 
 

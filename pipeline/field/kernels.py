@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
+from pipeline.compiled import kept_with
 from pipeline.field import potential as formulas
 
 # The compiled code calls the very functions that NumPy users call.
@@ -36,6 +38,20 @@ ASKED: dict[str, Any] = {
 }  # fmt: skip
 # No way in from Python, which would be compiled too.
 INNER = {**ASKED, "no_cpython_wrapper": True}
+
+_SOURCES = ("potential", "kernels", "batches", "tool_kernels")
+
+
+def asked(function: Any) -> Any:
+    """Compile what Python calls."""
+    with kept_with(Path(__file__).parent, _SOURCES):
+        return njit(**ASKED)(function)
+
+
+def inner(function: Any) -> Any:
+    """Compile what only compiled code calls."""
+    with kept_with(Path(__file__).parent, _SOURCES):
+        return njit(**INNER)(function)
 
 
 _FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)
@@ -111,7 +127,7 @@ def _sum(typing_context: Any, phases: Any, rows: Any, weights: Any) -> Any:
     return types.UniTuple(types.float64, 4)(phases, rows, weights), generate
 
 
-@njit(**INNER)
+@inner
 def _three(place, count):  # type: ignore[no-untyped-def]
     """Three neighbours of a place on one axis, their weights, and their slopes per step.
 
@@ -130,7 +146,7 @@ def _three(place, count):  # type: ignore[no-untyped-def]
     return middle, (w0, w1, w2), (s0, s1, s2)
 
 
-@njit(**INNER)
+@inner
 def _four(weights, left):  # type: ignore[no-untyped-def]
     """Weights of three neighbours as those of four nodes, the first of them at ``left``."""
     w0, w1, w2 = weights
@@ -142,7 +158,7 @@ def _four(weights, left):  # type: ignore[no-untyped-def]
     return (w1, w2, 0.0, 0.0) if left < 0 else (0.0, 0.0, w0, w1)
 
 
-@njit(**INNER)
+@inner
 def moment_of(line, phase):  # type: ignore[no-untyped-def]
     """Interval of a phase in ``spline.timeline``, and the weights of its three phases."""
     first, count = line[0, 0], len(line)
@@ -167,7 +183,7 @@ def moment_of(line, phase):  # type: ignore[no-untyped-def]
     return low, (before, 1.0 - before - after, after)
 
 
-@njit(**INNER)
+@inner
 def spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Distance and gradient at one point whose numbers are finite; see ``sample``."""
     width, height, depth = int(grid[6]), int(grid[7]), int(grid[8])
@@ -205,7 +221,7 @@ def fetch(typing_context: Any, address: Any) -> Any:
     return types.void(types.uintp), generate
 
 
-@njit(**INNER)
+@inner
 def _expect(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Bring what a question will ask for into the cache.
 
@@ -225,7 +241,7 @@ def _expect(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-
     return x_mm, y_mm, grid[2] + (n + 1) * grid[5], line[k, 0], line[k, 1]
 
 
-@njit(**ASKED)
+@asked
 def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Distance and gradient at one point: four numbers, none where the question has none.
 
@@ -236,7 +252,7 @@ def distance_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore
     return spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase)
 
 
-@njit(**INNER)
+@inner
 def felt_at(law, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Force and distance at one point whose numbers are finite: four numbers.
 
@@ -249,7 +265,7 @@ def felt_at(law, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     return scale * gx, scale * gy, scale * gz, distance_mm
 
 
-@njit(**ASKED)
+@asked
 def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm, phase):  # type: ignore[no-untyped-def]
     """Force at one point: three newtons, none where the question has a number that is none."""
     if not math.isfinite(x_mm + y_mm + z_mm + phase):
@@ -259,7 +275,7 @@ def force_at(addresses, line, grid, side, delta_mm, m, f_max_n, x_mm, y_mm, z_mm
     return fx, fy, fz
 
 
-@njit(**ASKED)
+@asked
 def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # type: ignore[no-untyped-def]
     """Distance and its gradient at points.
 
@@ -297,7 +313,7 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
 
 
-@njit(**ASKED)
+@asked
 def sample_force(law, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
     """Force at points into ``(n, 3)``; ``law`` is the first seven arguments of ``force_at``."""
     addresses, line, grid = law[:3]

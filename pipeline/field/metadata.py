@@ -13,7 +13,6 @@ from pipeline.errors import InputError
 from pipeline.field.fixture import DEVICES, Device, Fixture, Kind, Side
 from pipeline.geometry import require_rigid
 
-FORMAT_VERSION = 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 Row = tuple[float, float, float, float]

@@ -79,6 +79,8 @@ def fit_to_surface(
     if rounds == 0:
         return 0.0
     places = [(phase, _inside(points, grid)) for phase, points in _places(moving, phases, grid)]
+    # Between phases that lie close together a spline may carry all points out of the grid.
+    places = [(phase, points_mm) for phase, points_mm in places if len(points_mm)]
     low, high = _box([points_mm for _, points_mm in places], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     line = timeline(phases)

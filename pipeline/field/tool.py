@@ -20,7 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import Section
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Grid, require_rigid, transform_points
 from pipeline.meshes import require_whole
 
 Point = tuple[float, float, float]
@@ -135,6 +135,45 @@ class Mesh(_Tool):
 
 
 Tool = Annotated[Needle | Cylinder | Torus | Polyline | Mesh, Field(discriminator="shape")]
+
+
+def outside_share(grid: Grid, tool: Tool, mr_from_tool: Float) -> float:
+    """Share of a tool's length that lies outside the grid, 0 to 1.
+
+    There ``ForceField.tool_force`` is answered by the grid's boundary: the more, the less it tells.
+
+    Parameters
+    ----------
+    grid
+        ``ForceField.grid``.
+    tool
+        A line of one point weighs as much as 1 mm.
+    mr_from_tool
+        4x4, the tool's pose in LPS mm.
+
+    Raises
+    ------
+    InputError
+        When the pose is not rigid.
+    """
+    require_rigid(np.asarray(mr_from_tool), "mr_from_tool")
+    points, starts = transform_points(mr_from_tool, tool.lines.points_mm), tool.lines.starts
+    # Pieces go from each point but a line's last to the next; an only point is a piece, too.
+    alone = starts[:-1][np.diff(starts) == 1]
+    start = np.union1d(np.setdiff1d(np.arange(len(points)), starts[1:] - 1), alone)
+    end = start + ~np.isin(start, alone)
+    from_mm, way_mm = points[start], points[end] - points[start]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        faces = (np.stack([grid.origin_mm, grid.upper_mm])[:, None] - from_mm) / way_mm
+    # Along an axis on which a piece does not move it is between the faces all the way, or never.
+    between = (from_mm >= grid.origin_mm) & (from_mm <= grid.upper_mm)
+    enters = np.where(way_mm == 0, 0, faces.min(axis=0)).max(axis=1).clip(min=0)
+    leaves = np.where(way_mm == 0, between, faces.max(axis=0)).min(axis=1).clip(max=1)
+    length_mm, line = np.linalg.norm(way_mm, axis=1), np.searchsorted(starts, start, "right")
+    points_only = np.bincount(line, length_mm)[line] == 0
+    weight = np.where(points_only, 1 / np.bincount(line)[line], length_mm)
+    inside = np.where(points_only, between.all(axis=1), (leaves - enters).clip(min=0))
+    return float(1 - (weight * inside).sum() / weight.sum())
 
 
 def _corners_mm(path: Path) -> Float:

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from pipeline.field import kernels
 from pipeline.field import potential as formulas
 
 _felt_at = kernels.felt_at
 _pull = formulas.pull
-ASKED, INNER = kernels.ASKED, kernels.INNER
+_asked, _inner = kernels.asked, kernels.inner
 
 HALVINGS = 12
 """A stretch of a tool is halved no more often than this."""
@@ -23,7 +22,7 @@ LONGEST = 20.0
 """Times the grid's diagonal: a tool's line that is longer is in another unit."""
 
 
-@njit(**INNER)
+@_inner
 def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
     """Point of a tool at a length along it, into ``feel[:3]``.
 
@@ -47,7 +46,7 @@ def _on_tool(line_mm, along, walk, feel):  # type: ignore[no-untyped-def]
         feel[axis] = line_mm[piece, axis] + share * (line_mm[end, axis] - line_mm[piece, axis])
 
 
-@njit(**INNER)
+@_inner
 def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
     x = line_mm[piece + 1, 0] - line_mm[piece, 0]
     y = line_mm[piece + 1, 1] - line_mm[piece, 1]
@@ -55,7 +54,7 @@ def _piece_length(line_mm, piece):  # type: ignore[no-untyped-def]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(**INNER)
+@_inner
 def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-untyped-def]
     """Ask at a length along a tool: its point, the force and the distance into ``feel``."""
     _on_tool(line_mm, along, walk, feel)
@@ -65,7 +64,7 @@ def _feel(law, line_mm, pose, phase, along, walk, feel):  # type: ignore[no-unty
     feel[3], feel[4], feel[5], feel[6] = _felt_at(law, x, y, z, phase)
 
 
-@njit(**INNER)
+@_inner
 def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
     """Add a share of a felt force, and of its torque about the handle."""
     ax, ay, az = feel[0] - handle_mm[0], feel[1] - handle_mm[1], feel[2] - handle_mm[2]
@@ -79,7 +78,7 @@ def _add(found, feel, weight, pose, handle_mm):  # type: ignore[no-untyped-def]
     found[5] += weight * (x * feel[4] - y * feel[3])
 
 
-@njit(**INNER)
+@_inner
 def _is_rigid(pose):  # type: ignore[no-untyped-def]
     """Whether a 4x4 is a rotation and a shift, within 1e-3: the quick form of a slow check."""
     off = abs(pose[3, 0]) + abs(pose[3, 1]) + abs(pose[3, 2]) + abs(pose[3, 3] - 1.0)
@@ -96,7 +95,7 @@ def _is_rigid(pose):  # type: ignore[no-untyped-def]
     return pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z > 0.0
 
 
-@njit(**INNER)
+@_inner
 def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # type: ignore[no-untyped-def]
     """``tool_force`` on one line; its length, and how often the field was asked, -1: too long."""
     grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
@@ -148,14 +147,14 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
     return total, asked
 
 
-@njit(**INNER)
+@_inner
 def _diagonal(grid):  # type: ignore[no-untyped-def]
     """Length of the grid from corner to corner."""
     x, y, z = (grid[6] - 1) * grid[3], (grid[7] - 1) * grid[4], (grid[8] - 1) * grid[5]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(**INNER)
+@_inner
 def _length(line_mm):  # type: ignore[no-untyped-def]
     """Length of a whole line."""
     total = 0.0
@@ -164,7 +163,7 @@ def _length(line_mm):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(**INNER)
+@_inner
 def _halve(stack, places, top, left, right):  # type: ignore[no-untyped-def]
     """Put the two halves of the topmost segment in its place, the left one on top."""
     # Whole rows at once would take a second longer to compile.
@@ -178,7 +177,7 @@ def _halve(stack, places, top, left, right):  # type: ignore[no-untyped-def]
     places[top + 1, 2], places[top + 1, 3] = share, depth
 
 
-@njit(**ASKED)
+@_asked
 def tool_force(law, points_mm, starts, handle_mm, pose, phase, bound_n, found):  # type: ignore[no-untyped-def]
     """Force and torque on lines of straight pieces: the mean over their length, within a bound.
 

@@ -152,3 +152,15 @@ def _negate(winding, distance, first, end):  # type: ignore[no-untyped-def]
             for i in range(distance.shape[2]):
                 if winding[k, j, i] > 0:
                     distance[k, j, i] = -distance[k, j, i]
+
+
+def winding_number(corners_mm: Float) -> float:
+    """How often triangles ``(n, 3, 3)`` wind around the origin.
+
+    Solid angles by van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30:125-126 (1983).
+    """
+    a, b, c = corners_mm.transpose(1, 0, 2)
+    p, q, r = (np.linalg.norm(one, axis=1) for one in (a, b, c))
+    triple = (a * np.cross(b, c)).sum(axis=1)
+    around = p * q * r + (a * b).sum(axis=1) * r + (a * c).sum(axis=1) * q + (b * c).sum(axis=1) * p
+    return float(np.arctan2(triple, around).sum() / (2 * np.pi))

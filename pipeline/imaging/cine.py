@@ -14,10 +14,9 @@ from pipeline.imaging.frames import (
     LEAST_OF_A_BEAT,
     MIN_PHASES,
     MIN_SLICES,
-    NEAREST_SLICES_MM,
     Frame,
+    by_slice,
     choose_stack,
-    slice_positions,
     stacks_beside,
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
@@ -71,6 +70,9 @@ class Stack:
     remarks: tuple[str, ...] = ()
     """What the files leave open, and a person must know before the products are used."""
 
+    patient: str = ""
+    """The patient's identifier; empty where the files do not tell."""
+
 
 def stack_frames(
     frames: Sequence[Frame],
@@ -108,7 +110,7 @@ def stack_frames(
         )
     chosen, left_out = choose_stack(frames, where)
     _require_timing(chosen)
-    slices, time_name = _in_time(_slices_in_order(chosen), where)
+    slices, time_name = _in_time(by_slice(chosen), where)
     lines = left_out_lines([*left_out, *others], where)
     try:
         _require_complete(slices, where)
@@ -124,7 +126,8 @@ def stack_frames(
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
     doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen, where)
-    return Stack(cine, triggers, rr_ms, source, lines, doubts)
+    patient = next((frame.patient for frame in chosen if frame.patient), "")
+    return Stack(cine, triggers, rr_ms, source, lines, doubts, patient)
 
 
 def _unlike(frames: Sequence[Frame], name: str) -> str:
@@ -169,6 +172,12 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
             f"{seconds} correct the timing, or cine.rr_ms in study.yaml, which goes before it"
         )
     phases = trigger_times_ms / rr_ms[:, None]
+    if not np.isfinite(phases).all():
+        number, phase = np.argwhere(~np.isfinite(phases))[0]
+        raise InputError(
+            f"{where}: the trigger time of slice {number}, phase {phase}, is "
+            f"{trigger_times_ms[number, phase]:g}; give a number of milliseconds"
+        )
     if phases.min() < 0 or phases.max() >= 1:
         raise InputError(
             f"{where}: trigger times from {trigger_times_ms.min():g} to "
@@ -217,18 +226,6 @@ def _rr_ms(frame: Frame) -> float:
             "(0018,1088)); give cine.rr_ms in study.yaml"
         )
     return frame.rr_ms
-
-
-def _slices_in_order(frames: Sequence[Frame]) -> list[list[Frame]]:
-    """Frames by slice, the slices in order along the normal."""
-    along_mm = np.array([float(frame.middle_mm @ frames[0].normal) for frame in frames])
-    starts_mm = slice_positions(frames)
-    # Half the least distance of two slices: rounded positions fall on the right side.
-    which = np.searchsorted(starts_mm - NEAREST_SLICES_MM / 2, along_mm) - 1
-    slices: list[list[Frame]] = [[] for _ in starts_mm]
-    for frame, number in zip(frames, which, strict=True):
-        slices[number].append(frame)
-    return slices
 
 
 def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[Frame]], str]:

@@ -159,7 +159,10 @@ def _best_in_space(images: Float32, step: int) -> Float:
 
 
 def _best_overlap_in_space(heart: Mask, step: int) -> Float:
+    """Dice with the slice ``step`` before or after, the larger; 1 where there is neither."""
     best = np.zeros(heart.shape[:2])
+    count = heart.shape[1]
+    best[:, max(count - step, 0) : step] = 1
     after = _dice(heart[:, step:], heart[:, :-step])
     best[:, :-step] = after
     best[:, step:] = np.maximum(best[:, step:], after)

@@ -372,7 +372,9 @@ def _series_name(dataset: Any) -> str:
 def _kind(dataset: Any, frame_type: Any) -> str:
     """``original`` magnitude images, or else what sort of image it is."""
     described = frame_type.get("FrameType") or dataset.get("ImageType") or []
-    values = [str(value).upper() for value in described] if len(described) else []
+    # A single value, of which there should be two or more, comes as text and not as a list.
+    described = [described] if isinstance(described, str) else described
+    values = [str(value).upper() for value in described]
     component = frame_type.get("ComplexImageComponent") or dataset.get("ComplexImageComponent")
     if component not in (None, "", "MAGNITUDE"):
         return str(component).lower()

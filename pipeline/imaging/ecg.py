@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Mask
 from pipeline.study_files import names_in_header
 
 MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
@@ -45,6 +45,9 @@ class Ecg:
 
     start_s: float = 0.0
     """Time of the first sample on the recording's own clock."""
+
+    patient: str = ""
+    """The patient's identifier; empty where the file does not tell, as of all formats but DICOM."""
 
 
 def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
@@ -243,7 +246,8 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
     """Decode one multiplex group of channels."""
     group = dataset.WaveformSequence[index]
     try:
-        signal = np.asarray(dataset.waveform_array(index), dtype=float)
+        signal = np.array(dataset.waveform_array(index), dtype=float)
+        signal[_is_padding(dataset, index)] = np.nan
         channels = list(group.ChannelDefinitionSequence)
         rate_hz = float(group.SamplingFrequency)
         names = tuple(_lead_name(channel) for channel in channels)
@@ -253,7 +257,33 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
             f"{path}: the waveform cannot be decoded ({error}); it needs complete samples, a "
             "sampling frequency, and a source and a unit for each channel; export it again"
         ) from error
-    return Ecg(signal * [_millivolts(unit, str(path)) for unit in units], names, rate_hz)
+    scale = [_millivolts(unit, str(path)) for unit in units]
+    patient = str(dataset.get("PatientID", "") or "").strip()
+    return Ecg(signal * scale, names, rate_hz, patient=patient)
+
+
+def other_patient(ecg: Ecg, cine_patient: str, path: Path) -> list[str]:
+    """A sentence where an ECG says that it is of another patient than the cine; else none.
+
+    Told, not refused: systems that write one patient under two identifiers are common.
+    """
+    if not ecg.patient or not cine_patient or ecg.patient == cine_patient:
+        return []
+    return [
+        f"{path} has the PatientID {ecg.patient!r}, the cine {cine_patient!r}: make sure that both "
+        "are of one patient"
+    ]
+
+
+def _is_padding(dataset: Any, index: int) -> Mask:
+    """Samples that stand for none ``(n, channels)``, which the library gives as they are."""
+    from pydicom.waveforms import multiplex_array
+
+    stored = multiplex_array(dataset, index, as_raw=True)
+    padding = dataset.WaveformSequence[index].get("WaveformPaddingValue")
+    if not padding:
+        return np.zeros(stored.shape, bool)
+    return np.asarray(stored == np.frombuffer(padding, stored.dtype)[0])
 
 
 def _lead_name(channel: Any) -> str:

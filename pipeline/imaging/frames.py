@@ -108,10 +108,11 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
     ranked = _ranked(_alike(frames))
     _require_one_largest(ranked, where)
     stack, stills = _without_stills(ranked[0][1])
-    slices_mm = slice_positions(stack)
     left_out = copies + _spared(stills, "one moment of the beat, no cine")
-    for _, others in ranked[1:]:
-        reason = _why_left_out(stack[0], slices_mm, others)
+    # What joins the stack comes first: a set of its slices is not to be judged without them.
+    rest = sorted((one for _, one in ranked[1:]), key=lambda one: not _joins(stack[0], one[0]))
+    for others in rest:
+        reason = _why_left_out(stack[0], slice_positions(stack), others)
         if reason:
             left_out += _spared(others, reason)
         elif _joins(stack[0], others[0]):
@@ -188,19 +189,20 @@ def _parallel(first: Frame, frame: Frame) -> bool:
     return abs(float(first.normal @ frame.normal)) > PARALLEL_COSINE
 
 
-def _by_slice(frames: Sequence[Frame]) -> list[list[Frame]]:
-    """The frames of each slice of the set."""
-    slices_mm = slice_positions(frames) - NEAREST_SLICES_MM / 2
-    slices: list[list[Frame]] = [[] for _ in slices_mm]
+def by_slice(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """The frames of each slice, the slices in order along the first frame's normal."""
+    # Half the least distance of two slices: rounded positions fall on the right side.
+    starts_mm = slice_positions(frames) - NEAREST_SLICES_MM / 2
+    slices: list[list[Frame]] = [[] for _ in starts_mm]
     for frame in frames:
         along_mm = float(frame.middle_mm @ frames[0].normal)
-        slices[int(np.searchsorted(slices_mm, along_mm)) - 1].append(frame)
+        slices[int(np.searchsorted(starts_mm, along_mm)) - 1].append(frame)
     return slices
 
 
 def _moments(frames: Sequence[Frame]) -> list[int]:
     """Number of different times that each slice shows."""
-    return [len({tuple(frame.times_ms.values()) for frame in one}) for one in _by_slice(frames)]
+    return [len({tuple(frame.times_ms.values()) for frame in one}) for one in by_slice(frames)]
 
 
 def _is_cine(frames: Sequence[Frame]) -> bool:
@@ -212,7 +214,7 @@ def _spans_beat(frames: Sequence[Frame]) -> bool:
     """Whether most slices are seen through a beat rather than at nearly one moment of it, as in
     perfusion and mapping, which show a slice many times."""
     beat_ms = next((frame.rr_ms for frame in frames if frame.rr_ms), USUAL_RR_MS)
-    spans_ms = [last_ms - first_ms for first_ms, last_ms in map(_time_range_ms, _by_slice(frames))]
+    spans_ms = [last_ms - first_ms for first_ms, last_ms in map(_time_range_ms, by_slice(frames))]
     return float(np.median(spans_ms)) >= LEAST_OF_A_BEAT * beat_ms
 
 
@@ -305,7 +307,7 @@ def _within(series: Sequence[Frame], cine: Sequence[Frame], slices_mm: Float) ->
     if not _covered(series, normal, slices_mm):
         return False
     near_mm = _half_step_mm(slices_mm)
-    places_mm = slice_positions(series) * float(np.sign(series[0].normal @ normal))
+    places_mm = np.array([float(frame.middle_mm @ normal) for frame in series])
     beside = [
         frame
         for frame in cine

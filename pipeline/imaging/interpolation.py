@@ -68,7 +68,9 @@ def isotropic_labels(
         ``(phase, z, y, x)``, and the ``(x, y, z)`` position of its first voxel: mm along columns,
         rows and heights, from the centre of pixel (0, 0) at height 0.
     """
-    cut = _cut_around(probability, margin_mm, pixel_mm)
+    # Depths need what lies about the outline, and a displaced heart room to be moved back in.
+    room_mm = BAND_MM + float(np.abs(shifts_mm).max())
+    cut = _cut_around(probability, max(margin_mm, room_mm), pixel_mm)
     below_mm, above_mm = plane_mm[0] - reach_mm, plane_mm[-1] + reach_mm
     height_mm = np.arange(below_mm, above_mm + grid_mm, grid_mm)
     slices = np.arange(planes_a_slice // 2, len(plane_mm), planes_a_slice)

@@ -84,11 +84,13 @@ def _view(frames: Sequence[Frame]) -> LongAxis | None:
     names = [name for name in first.times_ms if all(name in one.times_ms for one in timed)]
     if len(timed) < len(frames) or not names:
         return None
-    moments = {frame.times_ms[names[0]]: frame for frame in reversed(timed)}
+    # The most trusted of those that tell most images apart, as for the stack.
+    name = max(names, key=lambda one: len({frame.times_ms[one] for frame in timed}))
+    moments = {frame.times_ms[name]: frame for frame in reversed(timed)}
     ordered = [moments[time_ms] for time_ms in sorted(moments)]
     rr_ms = float(np.mean([frame.rr_ms for frame in ordered if frame.rr_ms is not None]))
     low_s, high_s = PLAUSIBLE_RR_S
-    phases = np.array([frame.times_ms[names[0]] for frame in ordered]) / rr_ms
+    phases = np.array([frame.times_ms[name] for frame in ordered]) / rr_ms
     rising = all(later > earlier for earlier, later in pairwise(phases))
     inside = phases[0] >= 0 and phases[-1] < 1 and low_s < rr_ms / 1000 < high_s
     if len(ordered) < MIN_PHASES or not rising or not inside:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,10 +17,10 @@ from pipeline.evaluation.places import settle
 from pipeline.evaluation.tracing import trace_along
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, Float32, MovingSurface, transform_points
-from pipeline.imaging.ultrasound import read_sweeps
+from pipeline.imaging.ultrasound import Sweep, read_sweeps
 from pipeline.paper.moving import animated
 from pipeline.paper.subject import Subject
-from pipeline.products import read_frames, read_surfaces, read_table
+from pipeline.products import FrameRow, read_frames, read_surfaces, read_table
 from pipeline.registration.correction import put_right
 from pipeline.report.page import Section, picture
 from pipeline.report.pictures import plane_cut
@@ -101,11 +102,7 @@ def _scene(subject: Subject, field: ForceField, structure: str) -> Scene:
     study = open_study(subject.study)
     if study.us is None:
         raise InputError(f"{subject.study}: has no us/; give a study with tracked ultrasound")
-    sweep = read_sweeps(study.us)[0]
-    rows = [
-        row for row in read_frames(subject.products / "register" / "frames.csv")
-        if row.sweep == sweep.name and row.valid
-    ]  # fmt: skip
+    sweep, rows = _shown(read_sweeps(study.us), subject.products / "register" / "frames.csv")
     frames = np.searchsorted(sweep.numbers, [row.frame for row in rows])
     assert field.mr_from_tracker is not None
     found = read_table(subject.products / "register" / "mr_from_tracker.json")
@@ -124,6 +121,19 @@ def _scene(subject: Subject, field: ForceField, structure: str) -> Scene:
         times_s[0] + traced[0].times_s, (traced[0].tips_mm, traced[1].tips_mm),
         (traced[0].forces_n, traced[1].forces_n),
     )  # fmt: skip
+
+
+def _shown(sweeps: Sequence[Sweep], path: Path) -> tuple[Sweep, list[FrameRow]]:
+    """The first sweep of which two frames or more bear the registration out, and these."""
+    valid = [row for row in read_frames(path) if row.valid]
+    for sweep in sweeps:
+        rows = [row for row in valid if row.sweep == sweep.name]
+        if len(rows) > 1:
+            return sweep, rows
+    raise InputError(
+        f"{path}: no sweep has two frames that bear the registration out; leave figure-6 out "
+        "(--only), or register sweeps that show the heart"
+    )
 
 
 def _line(

@@ -24,7 +24,6 @@ SHIFTS_MM = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 LATE_MS = (0.0, 10.0, 25.0, 50.0, 75.0, 100.0)
 PLACES = 1500
 BAND_MM = 10.0
-LEAST_N = 0.1
 
 BREATH_MM = 4.9
 """Mean caudal movement of the heart in free breathing (Shechter et al., IEEE Trans. Med. Imaging
@@ -175,7 +174,7 @@ def _task(axis: Axes, x: tuple[float, ...], found: Float, free: Float, label: st
 
 
 def _shift_table(field: ForceField, seed: int) -> Table:
-    """Largest errors that keep the median force error below ``LEAST_N``."""
+    """Median errors of each fixture's force for fields out of place and late."""
     head = ["fixture", "stiffness (N/m)"]
     head += [f"median force error at {shift:g} mm" for shift in (1.0, 2.0, 5.0)]
     head += [f"at {late:g} ms" for late in (25.0, 100.0)]

@@ -61,15 +61,18 @@ class Timing:
     def phases(self, offset_s: float = 0.0) -> list[Float]:
         """For each sweep the phases ``(n,)`` of its frames, whose clock is ahead by an offset.
 
+        A frame that an offset puts outside the R peaks stays at their end, as in `at`.
+
         Raises
         ------
         InputError
-            When frames lie more than a beat outside the R peaks.
+            When frames, as they are stamped, lie more than a beat outside the R peaks.
         """
-        return [
-            phases_at(times_s - offset_s, self.r_times_s, self.cycle_rr_s)
-            for times_s in self.times_s
-        ]
+        stamped = [phases_at(one, self.r_times_s, self.cycle_rr_s) for one in self.times_s]
+        if offset_s == 0.0:
+            return stamped
+        ends = np.cumsum([len(one) for one in stamped])
+        return np.split(self.at(np.arange(ends[-1]), offset_s), ends[:-1])
 
     def at(self, number: Integer, offset_s: float) -> Float:
         """Phases of frames, counted through all sweeps, at a trial offset.

@@ -34,7 +34,7 @@ from pipeline.registration.uncertainty import (
     in_radians,
     sandwich,
 )
-from pipeline.registration.verdict import Evidence, Grade, Verdict, judge
+from pipeline.registration.verdict import Evidence, Grade, Verdict, judge, outvoted
 
 # A frame with less of its picture in blood or at its walls has too little to compare.
 _LEAST_IN_VIEW = 0.05
@@ -360,9 +360,7 @@ def _summarise(
     frames = sum(sizes)
     covariance, corrections = _covariance(found, search, sizes)
     expected = expected_tre_mm(covariance, pivot.centre_mm, heart_mm)
-    # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
-    shown = level.samples.frames
-    verdict = _verdict(found, search, shown, float(np.sqrt((expected**2).mean())))
+    verdict = _verdict(found, search, sizes, float(np.sqrt((expected**2).mean())))
     judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
     residual = np.ones(frames)
     residual[level.samples.number] = 1 - level.at(pose).explained
@@ -390,11 +388,13 @@ def _summarise(
     )
 
 
-def _verdict(found: _Found, search: Search, frames: int, expected_mm: float) -> Verdict:
+def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
+    level, settings = found.everything, search.settings
     shift_mm, turn_deg = (
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
-    valid = int(found.bears_out.sum())
-    sure = found.confidence, found.rival
-    evidence = Evidence(*sure, expected_mm, valid, frames, shift_mm, turn_deg)
-    return judge(evidence, search.settings)
+    sure, valid = (found.confidence, found.rival), int(found.bears_out.sum())
+    against = outvoted(_sweep_of(level, sizes), found.bears_out, settings.min_frames)
+    # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
+    shown = level.samples.frames
+    return judge(Evidence(*sure, expected_mm, valid, shown, shift_mm, turn_deg, against), settings)

@@ -367,7 +367,8 @@ def _turn(c: Float, before_s: float, now_s: float) -> None:
         c[PHASE] += min(max(step, SLOWEST * natural), QUICKEST * natural)
         c[PHASE] -= math.floor(c[PHASE])
     off = wrapped(c[PHASE] - place)
-    h = max(c[SPREAD], 1e-4)
+    # Beats nearer to each other than is usual for a spread are none of a heart.
+    h = min(max(c[SPREAD], 1e-4), 0.5 * c[RR])
     late, early = _place(c, now_s, c[RR] + h), _place(c, now_s, c[RR] - h)
     by_interval = 0.5 * c[SPREAD] / h * wrapped(early - late)
     by_peak = R_SD_S / c[RR]

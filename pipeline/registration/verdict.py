@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from pipeline.geometry import Integer, Mask
 from pipeline.registration.settings import RegisterSettings
 
 Grade = Literal["good", "doubtful", "failed"]
 
+
+# Share of its frames up to which a sweep is against a pose, and from which it is for it.
+_AGAINST, _FOR = 0.1, 0.5
 
 # Share of the best score that another pose may reach before the answer is in doubt, or open.
 _DOUBTFUL_RIVAL, _EQUAL_RIVAL = 0.75, 0.9
@@ -39,6 +45,9 @@ class Evidence:
     turn_deg: float
     """From the start; 0 without one."""
 
+    outvoted: tuple[int, ...] = ()
+    """Sweeps, counted from 1, hardly any frame of which bears out what another sweep does."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -47,6 +56,27 @@ class Verdict:
     grade: Grade
     reason: str
     """In words; empty for a good one."""
+
+
+def outvoted(sweep: Integer, bears_out: Mask, least: int) -> tuple[int, ...]:
+    """Sweeps, counted from 1, that contradict another: each has a pose of its own.
+
+    Parameters
+    ----------
+    sweep, bears_out
+        ``(frames,)`` number of each frame's sweep, counted from 0, and whether it bears the
+        common pose out.
+    least
+        Fewer frames than this are no sweep that could speak.
+    """
+    shares = {
+        int(number): float(bears_out[sweep == number].mean())
+        for number in np.unique(sweep)
+        if (sweep == number).sum() >= least
+    }
+    if max(shares.values(), default=0.0) < _FOR:
+        return ()
+    return tuple(number + 1 for number, share in shares.items() if share <= _AGAINST)
 
 
 def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
@@ -114,6 +144,13 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
         )
     if evidence.rival > _DOUBTFUL_RIVAL:
         reasons.append(f"a pose far from this one agrees with the frames to {evidence.rival:.0%}")
+    if evidence.outvoted:
+        named = ", ".join(map(str, evidence.outvoted))
+        reasons.append(
+            f"hardly any frame of sweep {named} bears out what the others do, so one of them lies "
+            "beside its place, by more than is expected here: look at calibration, pixel size and "
+            "whether the patient or the tracker was moved between them"
+        )
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
     return reasons

@@ -44,6 +44,7 @@ def _seen(shown: Moments, confidence: Float, always: list[int]) -> str:
     text = "Chambers and heart muscle on the cine's own slices."
     if chosen < count:
         text += f" {chosen} of the {count} slices are shown."
+    text += f" {slices.how_it_lies(shown)}"
     return f"{text} Lowest confidence: {slices.lowest_place(confidence)}."
 
 
@@ -94,10 +95,15 @@ def _muscle(phases: Float, measures: Mapping[str, Any]) -> list[Picture]:
 
 
 def function_rows(measures: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Volumes, ejection fractions and mass, for the table at the top of the page."""
+    """Volumes, ejection fractions and mass, for the table at the top of the page.
+
+    A stack of the heart's tip alone may show no right ventricle.
+    """
     rows = []
     for short, name in (("LV", "lv_endocardium"), ("RV", "rv_endocardium")):
-        volumes = measures["volumes_ml"][name]
+        volumes = measures["volumes_ml"].get(name)
+        if volumes is None:
+            continue
         largest, smallest = max(volumes), min(volumes)
         rows.append(
             (f"{short} volume, largest / smallest", f"{largest:.0f} / {smallest:.0f} ml"),

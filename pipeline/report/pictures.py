@@ -56,6 +56,7 @@ def potential_on_slice(shown: Moments, field: ForceField, fixture: str) -> Figur
 
 def cuts_on_ultrasound(
     images: Sequence[Float32],
+    names: Sequence[str],
     image_from_mr: Float,
     phases: Float,
     surfaces: Mapping[str, MovingSurface],
@@ -66,6 +67,8 @@ def cuts_on_ultrasound(
     ----------
     images
         One a frame, ``(row, column)``; sizes may differ.
+    names
+        What each is called.
     image_from_mr
         ``(frame, 4, 4)``: MR millimetres to ``(column, row, off-plane)``.
     phases
@@ -73,20 +76,22 @@ def cuts_on_ultrasound(
     """
     figure = Figure(figsize=(3.2 * len(images), 2.9), layout="constrained")
     axes = figure.subplots(1, len(images), squeeze=False)[0]
-    for axis, image, transform, phase in zip(axes, images, image_from_mr, phases, strict=True):
+    frames = zip(axes, images, names, image_from_mr, phases, strict=True)
+    for axis, image, called, transform, phase in frames:
         show_grey(axis, image)
         for name, (colour, style) in SURFACE_STYLES.items():
             if name not in surfaces:
                 continue
             moving = surfaces[name]
             away = np.abs((moving.phases - phase + 0.5) % 1 - 0.5)
-            lines = plane_cut(moving.at(int(away.argmin())), transform)
+            # Joined, for dashes begin anew with every piece, and pieces are shorter than they.
+            lines = joined(plane_cut(moving.at(int(away.argmin())), transform))
             axis.add_collection(
-                LineCollection(list(lines), colors=colour, linestyles=style, linewidths=1.2)
+                LineCollection(lines, colors=colour, linestyles=style, linewidths=1.2)
             )
         rows, columns = image.shape
         axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-        axis.set_title(f"phase {phase:.2f}", fontsize=9)
+        axis.set_title(f"{called}, phase {phase:.2f}", fontsize=9)
     drawn = {name: style for name, style in SURFACE_STYLES.items() if name in surfaces}
     figure.legend(
         handles=[handle(name, *style) for name, style in drawn.items()],
@@ -115,6 +120,31 @@ def plane_cut(surface: Surface, image_from_mr: Float) -> Float:
     return np.asarray(np.stack(ends, axis=1)[crosses].reshape(-1, 2, 2))
 
 
+def joined(segments: Float) -> list[Float]:
+    """Segments ``(k, 2, 2)`` whose ends meet as the lines ``(n, 2)`` that they make up.
+
+    A closed line ends where it begins.
+    """
+    ends = [tuple(map(tuple, one)) for one in np.round(segments, 6).tolist()]
+    at: dict[tuple[float, ...], list[int]] = {}
+    for number, pair in enumerate(ends):
+        for end in pair:
+            at.setdefault(end, []).append(number)
+    # Open lines from their ends; what is left then is closed.
+    waiting = sorted(range(len(ends)), key=lambda one: min(len(at[end]) for end in ends[one]))
+    left, lines = set(waiting), []
+    for first in waiting:
+        line = sorted(ends[first], key=lambda end: len(at[end])) if first in left else []
+        left.discard(first)
+        while line and (following := left.intersection(at[line[-1]])):
+            number = min(following)
+            left.remove(number)
+            line.append(next((end for end in ends[number] if end != line[-1]), line[-1]))
+        if line:
+            lines.append(np.array(line))
+    return lines
+
+
 def _draw_field(
     axis: Axes, field: ForceField, fixture: str, points_mm: Float, phase: float, aspect: float
 ) -> AxesImage:
@@ -134,11 +164,12 @@ def _draw_field(
     in_plane = np.stack(
         [
             force_n @ _unit(points_mm[0, 1] - points_mm[0, 0]),
-            force_n @ _unit(points_mm[1, 0] - points_mm[0, 0]),
+            # Rows count downwards; arrows point up where this is positive, in mm, not in pixels.
+            -force_n @ _unit(points_mm[1, 0] - points_mm[0, 0]),
         ]
     )
     rows, columns = np.mgrid[0 : shape[0] : step, 0 : shape[1] : step]
-    arrows = axis.quiver(columns, rows, *in_plane, color="#56B4E9", angles="xy", width=0.004)
+    arrows = axis.quiver(columns, rows, *in_plane, color="#56B4E9", width=0.004)
     most_n = field.fixtures[fixture].f_max_n
     axis.quiverkey(arrows, 0.82, 0.04, most_n, f"{most_n:g} N", labelpos="E", labelcolor="w")
     return image

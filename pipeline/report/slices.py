@@ -53,6 +53,37 @@ def shown_slices(labels: Label, always: Sequence[int] = (), most: int = MOST_SLI
     return np.union1d(even, np.array(always, np.int64))
 
 
+def how_it_lies(shown: Moments) -> str:
+    """Sentences on which end of the stack is the apex, and which way pictures lie in the patient.
+
+    The apex is the end that is farther from the left atrium, where that is seen.
+    """
+    right, down, up_the_stack = (_letters(one) for one in shown.mr_from_index[:3, :3].T)
+    text = f"Right in the pictures is {right}, below {down}, higher slice numbers {up_the_stack} "
+    text += "(L left, P posterior, S superior; R, A, I)."
+    heights = [
+        np.flatnonzero((shown.labels == LABELS[name]).any(axis=(0, 2, 3)))
+        for name in ("left_atrium", "lv_myocardium")
+    ]
+    if not all(len(one) for one in heights):
+        return text
+    atrium, muscle = (float(one.mean()) for one in heights)
+    last = shown.labels.shape[1] - 1
+    end = 0 if atrium > muscle else last
+    return f"Slice {end} is the one nearest the apex. {text}" if atrium != muscle else text
+
+
+def _letters(direction: Float) -> str:
+    """Where a direction in LPS points, such as ``LP``: what it points to most comes first.
+
+    >>> _letters(np.array([0.8, -0.6, 0.1]))
+    'LA'
+    """
+    share = direction / np.linalg.norm(direction)
+    order = np.argsort(-np.abs(share))
+    return "".join("RAI LPS"[4 * (share[k] > 0) + k] for k in order if abs(share[k]) > 0.38)
+
+
 def worst_slices(confidence: Float, low: float) -> list[int]:
     """A few slices that are below ``low`` in ``(phase, z)``, to be shown whatever else is."""
     return [one.slice for one in doubts(confidence, low)[:MOST_WORST]]

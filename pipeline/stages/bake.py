@@ -18,6 +18,9 @@ from pipeline.products import read_surfaces, read_table
 if TYPE_CHECKING:
     from pipeline.config import Settings
 
+TOLD_OF_REGISTRATION = ("verdict", "reason", "expected_tre_mm", "chance_under_2_mm")
+"""What a field's ``source`` says of the registration behind ``mr_from_tracker``."""
+
 
 def run(job: Job) -> dict[str, Any]:
     """Write ``field.zarr``; its accuracy certificate is the stage's figures."""
@@ -26,12 +29,14 @@ def run(job: Job) -> dict[str, Any]:
     lost = job.figures("surface")["left_out"]
     fixtures, left_out = fixtures_for(job.settings, surfaces, lost)
     registered = job.product("register")
-    source = {"patient_id": job.study.patient_id, "beatfield": __version__}
+    source: dict[str, Any] = {"patient_id": job.study.patient_id, "beatfield": __version__}
     mr_from_tracker = None
     if registered:
         found = read_table(registered / "mr_from_tracker.json")
         mr_from_tracker = np.array(found["mr_from_tracker"])
         source["tracker"] = found["tracker"]
+        # Who loads the field sees neither the terminal nor the report.
+        source["registration"] = {name: found[name] for name in TOLD_OF_REGISTRATION}
     certificate = bake_field(
         job.folder / "field.zarr",
         surfaces,

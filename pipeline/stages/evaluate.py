@@ -11,12 +11,10 @@ from pipeline.errors import InputError
 from pipeline.evaluation.metrics import (
     closedness,
     dice,
-    ejection_fraction,
     phase_error,
     pooled_dice,
     surface_distance,
     target_registration_error_mm,
-    volumes_ml,
 )
 from pipeline.evaluation.motion import motion_error
 from pipeline.geometry import Label, MovingSurface, Surface
@@ -24,7 +22,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
 from pipeline.products import read_frames, read_labels, read_surfaces, read_table, write_table
-from pipeline.surface.measures import mean_lv_mass_g
+from pipeline.surface.measures import ejection_fraction, mean_lv_mass_g, volumes_ml
 
 LABEL_OF_SURFACE = {
     "lv_endocardium": "lv_cavity",
@@ -49,7 +47,8 @@ def run(job: Job) -> dict[str, Any]:
         raise Skipped("no truth in this study")
     known = _read_truth(truth)
     phases = np.array(read_table(job.products / "ingest" / "phases.json")["phases"])
-    if not np.allclose(phases, known["phases"], atol=0.02):
+    true_phases = np.array(known["phases"])
+    if phases.shape != true_phases.shape or not np.allclose(phases, true_phases, atol=0.02):
         raise InputError(f"{truth}/truth.json: its phases are not those of the cine")
     surfaces = read_surfaces(job.products / "surface", phases)
     found, known_labels = _labels(job, truth)
@@ -161,9 +160,12 @@ def _masses(job: Job, known: dict[str, Any]) -> dict[str, float]:
 
 def _ejection_fractions(
     surfaces: dict[str, MovingSurface], known: dict[str, Any], chamber: str
-) -> dict[str, float]:
-    found = ejection_fraction(volumes_ml(surfaces[chamber]))
+) -> dict[str, float | None]:
+    """Found and true; none is found of a chamber that has no surface."""
     truth = ejection_fraction(np.array(known["volumes_ml"][chamber]))
+    if chamber not in surfaces:
+        return {"found": None, "truth": round(truth, 4)}
+    found = ejection_fraction(volumes_ml(surfaces[chamber]))
     return {"found": round(found, 4), "truth": round(truth, 4)}
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Stack
 from pipeline.imaging.dicom import read_dicom_study
-from pipeline.imaging.ecg import read_ecg
+from pipeline.imaging.ecg import Ecg, other_patient, read_ecg
 from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
@@ -18,6 +20,14 @@ from pipeline.imaging.faults import (
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.job import Job
 from pipeline.products import write_cine
+from pipeline.registration.time import detect_r_peaks, summarise_rr
+
+WIDEST_STEP, MOST_STEPS = 0.25, 3.0
+"""Share of a beat between two phases, and times the usual step, beyond which it is told: gating
+that waits for the next R peak leaves out a fifth at the end."""
+
+OTHER_RATE = 1.3
+"""Times by which a heart may beat faster or slower in the ECG of the MR than in its images."""
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -38,7 +48,8 @@ def run(job: Job) -> dict[str, Any]:
     copies = require_different_images(stack.cine, str(files.path))
     for view in views:
         require_finite(view.cine, f"long-axis view {view.name}")
-    _require_ecg_as_long(job, stack)
+    ecg = None if job.study.ecg.mr is None else read_ecg(job.study.ecg.mr)
+    _require_ecg_as_long(job, stack, ecg)
     write_cine(job.folder, stack, views)
     cine = stack.cine
     return {
@@ -50,16 +61,56 @@ def run(job: Job) -> dict[str, Any]:
         "rr_s": round(cine.rr_s, 4),
         "timing_source": stack.timing_source,
         "left_out": list(stack.left_out),
-        "remarks": [*stack.remarks, *copies, *doubts_of_order(stack.cine)],
+        "remarks": [
+            *stack.remarks,
+            *copies,
+            *doubts_of_order(stack.cine),
+            *_doubts_of_beat(job, stack, ecg),
+            *_doubts_of_patient(job, stack, ecg),
+        ],
+        "patient": stack.patient,
         "long_axis": [view.name for view in views],
     }
 
 
-def _require_ecg_as_long(job: Job, stack: Stack) -> None:
+def _doubts_of_beat(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
+    """What speaks against the length of the heartbeat, or against the ECG beside it, in words."""
+    rr_s, phases = stack.cine.rr_s, stack.cine.phases
+    doubts = []
+    steps = np.diff(phases, append=phases[0] + 1)
+    widest = int(steps.argmax())
+    if steps[widest] > max(WIDEST_STEP, MOST_STEPS * float(np.median(steps))):
+        doubts.append(
+            f"no image shows the {steps[widest]:.0%} of the heartbeat after phase "
+            f"{phases[widest]:.2f}, and the motion there is a guess: is the RR interval of "
+            f"{1000 * rr_s:.0f} ms right? Times after the R peak are to be those of such a beat"
+        )
+    if ecg is None:
+        return doubts
+    try:
+        beats = summarise_rr(detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz))
+    except InputError:
+        # In a scanner that may be: nothing else reads this record.
+        return doubts
+    if not 1 / OTHER_RATE <= rr_s / beats.median_s <= OTHER_RATE:
+        doubts.append(
+            f"the cine's RR interval is {1000 * rr_s:.0f} ms, that of {job.study.ecg.mr} "
+            f"{1000 * beats.median_s:.0f} ms: either timing is wrong, or the ECG is of another "
+            "examination or patient"
+        )
+    return doubts
+
+
+def _doubts_of_patient(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
+    if ecg is None or job.study.ecg.mr is None:
+        return []
+    return other_patient(ecg, stack.patient, job.study.ecg.mr)
+
+
+def _require_ecg_as_long(job: Job, stack: Stack, ecg: Ecg | None) -> None:
     """Refuse an ECG that cannot be of this cine: every slice takes a heartbeat at the least."""
-    if job.study.ecg.mr is None:
+    if ecg is None:
         return
-    ecg = read_ecg(job.study.ecg.mr)
     lasts_s = len(ecg.signal_mv) / ecg.sampling_rate_hz
     # The slices of a volume are acquired together; nothing but a heartbeat is certain.
     beats_ms = stack.rr_ms[:1] if _is_volume(stack) else stack.rr_ms

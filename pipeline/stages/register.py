@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import Float, MovingSurface
-from pipeline.imaging.ecg import read_ecg
+from pipeline.imaging.ecg import Ecg, other_patient, read_ecg
 from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweeps, remarks_on
 from pipeline.job import Job, Skipped
 from pipeline.products import (
@@ -36,7 +36,8 @@ def run(job: Job) -> dict[str, Any]:
         raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
     start = _start(job)
     sweeps = read_sweeps(job.study.us)
-    r_times_s = _r_times_s(job.study)
+    ecg = _ecg(job.study)
+    r_times_s = _r_times_s(job.study, ecg)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle.get("rr_s"))
@@ -57,7 +58,7 @@ def run(job: Job) -> dict[str, Any]:
         "calibration": "; ".join(one.words() for one in found.corrections),
         "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
         **_clock_figures(found),
-        "remarks": remarks_on(sweeps),
+        "remarks": [*remarks_on(sweeps), *_doubts_of_patient(job, ecg)],
     }
 
 
@@ -72,7 +73,7 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
     if study.us is None:
         return
     sweeps = read_sweeps(study.us)
-    timing = _timing(study, sweeps, _r_times_s(study), None)
+    timing = _timing(study, sweeps, _r_times_s(study, _ecg(study)), None)
     if settings.on_failure == "stop":
         require_frames(sweeps, timing.phases(), settings)
 
@@ -118,9 +119,17 @@ def _timing(
     return Timing([sweep.times_s for sweep in sweeps], r_times_s, cycle_rr_s)
 
 
-def _r_times_s(study: Study) -> Float:
+def _ecg(study: Study) -> Ecg:
     assert study.ecg.us is not None, "a study with ultrasound has its ECG"
-    ecg = read_ecg(study.ecg.us)
+    return read_ecg(study.ecg.us)
+
+
+def _doubts_of_patient(job: Job, ecg: Ecg) -> list[str]:
+    assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
+    return other_patient(ecg, job.figures("ingest")["patient"], job.study.ecg.us)
+
+
+def _r_times_s(study: Study, ecg: Ecg) -> Float:
     try:
         return detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz) + ecg.start_s
     except InputError as error:

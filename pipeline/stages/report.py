@@ -22,7 +22,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
-from pipeline.summary import by_reason, cut_off_by, muscle_changes
+from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts
 
 ULTRASOUND_FRAMES_SHOWN = 4
 
@@ -117,17 +117,33 @@ def _notes(job: Job) -> list[str]:
     if missing:
         named = ", ".join(str(number) for number in missing)
         notes.append(f"Not recorded or spoilt, so drawn between their neighbours: slices {named}.")
-    notes += [f"Doubtful {text}." for text in muscle_changes(job.figures("segment"))]
+    told = doubts(job.figures("segment"), job.figures("surface"))
+    notes += [f"Doubtful {text}." for text in told]
     for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
     for why, names in by_reason(job.figures("surface")["left_out"]).items():
         notes.append(f"No surface of {', '.join(names).replace('_', ' ')}: {why}.")
     for name, why in job.figures("bake")["left_out"].items():
         notes.append(f"Left out: the default fixture {name}, which {why}.")
-    if not job.product("register"):
-        notes.append("No tracked ultrasound: the field is in the frame of the MR.")
+    notes += _registration_notes(job)
     if not job.product("evaluate"):
         notes.append("No known truth in this study: accuracy against truth was not measured.")
+    return notes
+
+
+def _registration_notes(job: Job) -> list[str]:
+    """What to mind of the ultrasound, before anything is looked at."""
+    if job.study.us is None:
+        return ["No tracked ultrasound: the field is in the frame of the MR."]
+    if not job.product("register"):
+        return [
+            "The tracked ultrasound could not be registered, for the reason in run.json under "
+            "register: the field is in the frame of the MR."
+        ]
+    figures = job.figures("register")
+    notes = [f"Clocks: {text}." for text in clock_put_right(figures)]
+    if figures["verdict"] != "good":
+        notes.append(f"Registration {figures['verdict']}: {figures['reason']}.")
     return notes
 
 
@@ -154,8 +170,9 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             for row, at in zip(chosen, places, strict=True)
         ]
     )
+    names = [f"{row.sweep}, frame {row.frame}" for row in chosen]
     figure = pictures.cuts_on_ultrasound(
-        images, image_from_mr, np.array([row.phase for row in chosen]), surfaces
+        images, names, image_from_mr, np.array([row.phase for row in chosen]), surfaces
     )
     heart_in_mm = certainty.expected_error(
         surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
@@ -223,13 +240,15 @@ def _evaluation(job: Job) -> list[Section]:
         return []
     metrics = read_table(folder / "metrics.json")
     rows = [_against_truth(name, one) for name, one in metrics["structures"].items()]
-    head = ["surface", "mean distance mm", "worst phase mm", "95 % Hausdorff mm", "mean Dice"]
-    head += ["worst Dice", "motion, normal mm", "tangential mm"]
+    head = ["surface", "mean distance mm", "worst phase mm", "95 % Hausdorff, worst phase mm"]
+    head += ["mean Dice", "worst Dice", "motion, normal mm", "tangential mm"]
     others = {key: value for key, value in metrics.items() if key != "structures"}
     return [
         Section(
             "Against truth",
-            "This study is synthetic, so its truth is known; only the evaluate stage reads it.",
+            "This study is synthetic, so its truth is known; only the evaluate stage reads it. "
+            "Dice is that of the labels: in the row of the epicardium of heart muscle, in that of "
+            "the LV endocardium of the cavity. Errors of the frames' phases are shares of a beat.",
             tables=[Table(head, rows), flat_table("registration and volumes", others)],
         )
     ]

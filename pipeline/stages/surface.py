@@ -8,19 +8,26 @@ import numpy as np
 
 from pipeline.job import Job
 from pipeline.products import read_labels, read_table, write_surfaces, write_table
+from pipeline.registration.clock import systole_s
 from pipeline.surface.extraction import extract
-from pipeline.surface.measures import mean_lv_mass_g, measures
+from pipeline.surface.measures import end_systole, mean_lv_mass_g, measures
 
 
 def run(job: Job) -> dict[str, Any]:
     """Write ``<structure>_000.vtp`` ... and ``measures.json``; see pipeline.surface.measures."""
     heart, mr_from_index = read_labels(job.products / "segment", "heart")
-    phases = np.array(read_table(job.products / "ingest" / "phases.json")["phases"])
+    cycle = read_table(job.products / "ingest" / "phases.json")
+    phases, rr_s = np.array(cycle["phases"]), float(cycle["rr_s"])
     found = extract(heart, mr_from_index, phases, job.settings.surface, job.progress)
     write_surfaces(job.folder, found.surfaces)
     table = measures(found.surfaces)
     write_table(job.folder / "measures.json", table)
+    cavity_ml = np.array(table["volumes_ml"]["lv_endocardium"])
     return _headline(table) | {
+        "end_systole": {
+            "phase": round(end_systole(phases, cavity_ml), 3),
+            "usual": round(systole_s(rr_s) / rr_s, 3),
+        },
         "triangles": {name: len(moving.triangles) for name, moving in found.surfaces.items()},
         "mended_phases": found.mended_phases,
         "crossing_triangles": found.crossing_triangles,

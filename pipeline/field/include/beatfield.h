@@ -171,6 +171,10 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
 
+/* Share of a tool's length that lies outside the grid, 0 to 1, where bf_tool_force is answered by the
+ * grid's boundary: the more there is, the less the force tells. 1 where there is no telling. */
+double bf_outside_share(const bf_field *field, const bf_tool *tool, const double mr_from_tool[16]);
+
 /* A moving fixture can push energy into the hand. A tank lets through only what it holds: energy
  * that the hand gives fills it, energy that the hand gets drains it, and where it is empty the part
  * of the force that would drive the motion on is withheld. Off unless it is used:
@@ -618,7 +622,7 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
     }
     if (!(m >= 1 && m <= 20) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
         !(part->f_max_n > 0 && part->f_max_n < 1e9) || forbidden != (part->side != 0) ||
-        (limited && !(part->f_max_n <= part->device_force_n)))
+        (limited && !(part->f_max_n <= part->device_force_n * (1 + 1e-9))))
         j->bad = 1;
     else part->m = (int)m;
 }
@@ -1949,7 +1953,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
         double edge = (field->shape[n] - 1) * field->spacing_mm[n];
         diagonal2 += edge * edge;
     }
-    if (total > BF__LONGEST * sqrt(diagonal2)) return BF_WRONG_SIZE;
+    if (total > (double)BF__LONGEST * sqrt(diagonal2)) return BF_WRONG_SIZE;
     walk.longest_mm = field->spacing_mm[0];
     for (n = 1; n < 3; n++)
         if (field->spacing_mm[n] < walk.longest_mm) walk.longest_mm = field->spacing_mm[n];
@@ -1972,6 +1976,39 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (torque_nmm) memcpy(torque_nmm, walk.torque_nmm, sizeof walk.torque_nmm);
     if (evaluations) *evaluations = walk.evaluations;
     return BF_OK;
+}
+
+double bf_outside_share(const bf_field *field, const bf_tool *tool, const double mr_from_tool[16])
+{
+    double total = 0, outside = 0, share;
+    int n, axis, pieces = tool->closed ? tool->count : tool->count - 1;
+    for (n = 0; n < pieces; n++) {
+        double a[3], b[3], length = bf__length(tool, n), enters = 0, leaves = 1;
+        bf_transform(mr_from_tool, tool->points_mm + 3 * (size_t)n, a);
+        bf_transform(mr_from_tool, tool->points_mm + 3 * (size_t)((n + 1) % tool->count), b);
+        for (axis = 0; axis < 3; axis++) {
+            double low = field->origin_mm[axis] - a[axis], way = b[axis] - a[axis];
+            double high = low + (field->shape[axis] - 1) * field->spacing_mm[axis];
+            if (way < 0) {
+                double swapped = low;
+                low = high;
+                high = swapped;
+            }
+            if (way < 0 || way > 0) {
+                if (low / way > enters) enters = low / way;
+                if (high / way < leaves) leaves = high / way;
+            } else if (!(low <= 0 && high >= 0)) leaves = 0;
+        }
+        total += length;
+        outside += leaves > enters ? length * (1 - leaves + enters) : length;
+    }
+    if (tool->count > 0 && !(total > 0)) {
+        double point_mm[3];
+        bf_transform(mr_from_tool, tool->points_mm, point_mm);
+        return !bf_contains(field, point_mm);
+    }
+    share = outside / total;
+    return share >= 0 && share <= 1 ? share : 1;
 }
 
 /* ---- energy ---- */

@@ -426,7 +426,7 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
         c->phase -= floor(c->phase);
     }
     off = bfc_wrapped(c->phase - place);
-    h = bfc_max(c->known.spread_s, 1e-4);
+    h = bfc_min(bfc_max(c->known.spread_s, 1e-4), 0.5 * rr_s);
     by_interval = 0.5 * c->known.spread_s / h *
                   bfc_wrapped(bfc_place(c, now_s, rr_s - h) - bfc_place(c, now_s, rr_s + h));
     by_peak = BFC_R_SD_S / rr_s;

@@ -1,0 +1,62 @@
+"""What the ingest stage says of the heartbeat: images, times and ECG must be of one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ecg_records import record
+
+from pipeline.config import Settings
+from pipeline.imaging.nifti import write_image
+from pipeline.job import Job
+from pipeline.stages import ingest
+from pipeline.study import open_study
+
+PHASES, SLICES = 10, 4
+
+
+def remarks_of(folder: Path, rr_ms: float, ecg_rr_s: float | None, shown: float = 1.0) -> list[str]:
+    """Remarks on noise whose phases are spread evenly over a share of beats of ``rr_ms``."""
+    for name in ("cine", "ecg", "out"):
+        (folder / name).mkdir()
+    rng = np.random.default_rng(2)
+    pixels = rng.normal(100, 20, (PHASES, SLICES, 48, 48)).astype(np.float32)
+    write_image(folder / "cine" / "cine.nii.gz", pixels, np.diag([2.0, 2.0, 8.0, 1.0]))
+    times_ms = (shown * rr_ms * np.arange(PHASES) / PHASES).tolist()
+    timing = {"trigger_times_ms": times_ms, "rr_ms": rr_ms}
+    (folder / "cine" / "timing.json").write_text(json.dumps(timing))
+    if ecg_rr_s is not None:
+        ecg = record(duration_s=20.0, mean_rr_s=ecg_rr_s, seed=4)
+        rows = [
+            f"{k / ecg.sampling_rate_hz:.4f},{one[0]:.5f}" for k, one in enumerate(ecg.signal_mv)
+        ]
+        (folder / "ecg" / "mr.csv").write_text("\n".join(["time_s,I", *rows, ""]))
+    (folder / "study.yaml").write_text("patient_id: p\n")
+    job = Job(open_study(folder), Settings(), folder, folder / "out", lambda done, total: None)
+    figures: dict[str, Any] = ingest.run(job)
+    return [one for one in figures["remarks"] if "order" not in one]
+
+
+@pytest.mark.parametrize("ecg_rr_s", [None, 0.8, 0.65])
+def test_a_beat_that_fits_raises_no_doubt(tmp_path: Path, ecg_rr_s: float | None) -> None:
+    assert remarks_of(tmp_path, 800.0, ecg_rr_s) == []
+
+
+def test_gating_that_waits_for_the_next_peak_raises_none(tmp_path: Path) -> None:
+    assert remarks_of(tmp_path, 800.0, None, shown=0.85) == []
+
+
+def test_a_beat_of_which_half_is_not_shown_is_told(tmp_path: Path) -> None:
+    """As of an RR interval of two beats, or cine.rr_ms of another examination."""
+    [told] = remarks_of(tmp_path, 1600.0, None, shown=0.5)
+    assert told.startswith("no image shows the 55% of the heartbeat after phase 0.45")
+
+
+def test_an_ecg_of_another_heart_rate_is_told(tmp_path: Path) -> None:
+    [told] = remarks_of(tmp_path, 1200.0, 0.8)
+    assert told.startswith("the cine's RR interval is 1200 ms, that of ")
+    assert "ms: either timing is wrong, or the ECG is of another" in told
