@@ -43,6 +43,13 @@ WEAK: Waves = (
     *((at, 1.3 * width, 0.3 * one, 0.3 * two) for at, width, one, two in QRS),
     (0.28, 0.050, 0.05, 0.03),
 )
+# First-degree block: P waves more than a quarter of a second ahead of low beats.
+LONG_PR: Waves = (
+    (-0.28, 0.025, 0.26, 0.18),
+    (0.0, 0.013, 0.55, -0.35),
+    (0.035, 0.014, -0.25, 0.10),
+    (0.32, 0.055, 0.12, 0.08),
+)
 # T waves of wide beats are large and, in a slow heart, late.
 SLOW_WIDE: Waves = (*WIDE[:2], (0.41, 0.055, 0.90, -0.80))
 LONE_P: Waves = ((-0.16, 0.022, 0.35, 0.20),)
@@ -144,6 +151,24 @@ def _fibrillation(rng, duration_s, times_s):
     return beats, signal
 
 
+def _fast_fibrillation(rng, duration_s, times_s):
+    """Beats of any size, often sooner than the last one's T wave is over."""
+    rr_s = np.clip(rng.gamma(9, 0.047, size=int(4 * duration_s)), 0.29, 1.5)
+    sizes = rng.uniform(0.4, 1.25, len(rr_s))
+    beats = [
+        (at_s, scaled((*QRS, *T), size))
+        for at_s, size in zip(0.4 + np.cumsum(rr_s), sizes, strict=True)
+    ]
+    return beats, draw(rng, times_s, beats)
+
+
+def _complete_block(rng, duration_s, times_s):
+    """Atria and ventricles each keep their own time, the ventricles slowly."""
+    atrial = [(at_s, LONE_P) for at_s in steady(rng, duration_s, 0.72, 0.02)]
+    beats = [(at_s + 0.5, (*QRS, *T)) for at_s in steady(rng, duration_s, 1.6, 0.02)]
+    return beats, draw(rng, times_s, sorted(atrial + beats), noise_mv=0.015)
+
+
 def _blocked(rng, duration_s, times_s):
     """Every third atrial wave reaches no ventricle, and every now and then none for 4 s."""
     beats, truth, at_s, count = [], [], 0.4, 0
@@ -217,7 +242,10 @@ CASES = {
     "alternans": partial(_alternating, one=NORMAL, other=scaled(NORMAL, 0.5), early_share=0.5),
     "runs": _runs,
     "fibrillation": _fibrillation,
+    "fast fibrillation": _fast_fibrillation,
     "blocked": _blocked,
+    "complete block": _complete_block,
+    "long PR, tall P": partial(_plain, waves=LONG_PR, rr_s=1.05, scatter=0.06, noise_mv=0.02),
     "gain": _gain,
     "first lead bad": _one_bad,
     "second lead bad": partial(_one_bad, lead=1),
@@ -232,7 +260,7 @@ CASES = {
 
 def record(case: str, seed: int, duration_s: float = 120.0, rate_hz: float = 360.0) -> Record:
     """One drawn record, quantised as Holter recorders do (5 microvolts a step)."""
-    rng = np.random.default_rng([seed, sorted(CASES).index(case)])
+    rng = np.random.default_rng([seed, *case.encode()])
     times_s = np.arange(round(duration_s * rate_hz)) / rate_hz
     beats, signal = CASES[case](rng, duration_s, times_s)
     r_times_s = np.array([at_s for at_s, _ in beats if at_s < duration_s - 0.05])

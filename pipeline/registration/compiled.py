@@ -13,7 +13,7 @@ from pipeline.compiled import kept_with
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_SOURCES = ("detector_state", "waves", "quality", "levels", "qrs", "ticks")
+_SOURCES = ("detector_state", "waves", "quality", "levels", "rules", "qrs", "ticks")
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

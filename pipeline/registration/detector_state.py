@@ -12,9 +12,10 @@ TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, INSTEAD, FIELDS = range(8)
 (
     LEVEL, NOISE, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
     SIGN, SCATTER, LEAN, LEAN_NOW, PEAK, FINER, HEIGHT_MV,
-    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END, LEAD_FIELDS,
-) = range(26)  # fmt: skip
-LEARNT_OF_BEATS = (LEVEL, WAY, OFFSET, SHIFT, TIMED, SIZE, SCATTER, LEAN)
+    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END, TALL, STEEP,
+    TALL_HERE, STEEP_HERE, LEAD_FIELDS,
+) = range(30)  # fmt: skip
+LEARNT_OF_BEATS = (LEVEL, WAY, OFFSET, SHIFT, TIMED, SIZE, SCATTER, LEAN, TALL, STEEP)
 """What a beat changes of a lead."""
 # Counters.
 (
@@ -29,10 +30,14 @@ LEARNT_OF_BEATS = (LEVEL, WAY, OFFSET, SHIFT, TIMED, SIZE, SCATTER, LEAN)
     LEARN_AT,
     USABLE,
     BEATS,
+    TOWERS,
     COUNTERS,
-) = range(12)
+) = range(13)
 # Numbers.
-BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, LAST_LIKENESS, NUMBERS = range(6)
+(
+    BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, LAST_LIKENESS, LAST_STEEP, LAST_TALL, TALL_NOW,
+    STEEP_NOW, NUMBERS,
+) = range(10)  # fmt: skip
 KEPT_INTERVALS, KEPT_WAVES = 8, 64
 SHAPE_POINTS = 21
 """Places about R at which shapes are compared."""
@@ -81,7 +86,7 @@ class State(NamedTuple):
     fused: Float
     """``(length,)`` energy of all leads in units of a beat."""
     waves: Float
-    """``(KEPT_WAVES, 2)`` sample and height of waves since the last beat that were no beats."""
+    """``(KEPT_WAVES, 4)`` latest waves that were no beats: sample, energy, steepness, height."""
     intervals: Float
     """``(KEPT_INTERVALS,)`` latest RR intervals in samples."""
     leads: Float

@@ -10,13 +10,17 @@ from pipeline.registration.detector_state import KEPT_WAVES, LEVEL, NOISE, WEIGH
 
 REFRACTORY_S = 0.20
 """No two beats are closer together."""
+LONE = 0.5
+"""A wave stands out alone where the next lower one has less than so much of its energy."""
 
 
 @compiled
-def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float]:
-    """Energy of a lead's beats and of what lies between them, from a stretch of samples.
+def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float, bool]:
+    """Energy of a lead's beats and of what lies between them, from a stretch of samples; and
+    whether one wave alone stands out.
 
-    Beats are the highest waves; the one highest of all may be a tug at the electrode.
+    Beats are the highest waves; the one highest of all may be a tug at the electrode, or the only
+    beat that a slow heart has had in that time, between its atrial waves.
     """
     seen, waves = np.empty(last - first + 1), np.empty(KEPT_WAVES)
     count, best, best_at = 0, 0.0, first
@@ -31,10 +35,11 @@ def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[fl
             best, best_at = 0.0, i
     seen.sort()
     if count == 0:
-        return 0.8 * seen[-1], seen[int(0.7 * len(seen))]
+        return 0.8 * seen[-1], seen[int(0.7 * len(seen))], False
     found = np.sort(waves[:count])
+    lone = count > 1 and found[-2] < LONE * found[-1]
     high = found[found > 0.4 * found[max(0, count - 2)]]
-    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))]
+    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))], lone
 
 
 @compiled

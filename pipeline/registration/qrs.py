@@ -34,6 +34,8 @@ from pipeline.registration.detector_state import (
     LAST_BEAT,
     LAST_HEIGHT,
     LAST_LIKENESS,
+    LAST_STEEP,
+    LAST_TALL,
     LATE,
     LEARN_AT,
     LEARNT,
@@ -43,7 +45,11 @@ from pipeline.registration.detector_state import (
     NOISE,
     RUN,
     SEEN,
+    STEEP,
+    STEEP_NOW,
     STRANGE,
+    TALL,
+    TALL_NOW,
     USABLE,
     USUAL_RR,
     WAITING,
@@ -53,27 +59,24 @@ from pipeline.registration.detector_state import (
 )
 from pipeline.registration.levels import REFRACTORY_S, follow_noise, learn_level, wave_levels
 from pipeline.registration.quality import RUN_S, SETTLE_S, shows_nothing, watch
-from pipeline.registration.waves import ALIKE, learn_beat, measure_beat
+from pipeline.registration.rules import (
+    DULL,
+    LATE_T_WAVE_S,
+    T_WAVE_S,
+    VERY_ALIKE,
+    is_beat,
+    learn_stature,
+    measure_stature,
+    resembles,
+    towers,
+)
+from pipeline.registration.waves import learn_beat, measure_beat
 
-AHEAD_S, AHEAD, LOW, OWN = 0.25, 2.0, 0.7, 0.98
+AHEAD_S, LONG_AHEAD_S, AHEAD, LOW, OWN = 0.25, 0.32, 2.0, 0.7, 0.98
 """A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
-ventricle beats twice in that time. Unless it is just like a beat and came when one was due: a tug
-at the electrode may follow a small beat. P waves come too soon, and are 0.90 to 0.98 like beats."""
-T_WAVE_S, USUAL_S = 0.36, 0.8
-"""Until so long after a beat a wave of less than half its energy is that beat's T wave; where the
-usual RR interval is longer than so, later by its root (Bazett, Heart 7:353-370, 1920)."""
-LATE_T_WAVE_S = 0.45
-"""The same at most, and when a beat is overdue, for then the heart is slow."""
-FADE_S, LARGE = 0.15, 1.6
-"""Beats of another shape, or so large, are wide or have large T waves: after them what a wave needs
-falls to nothing in so long, not at once."""
-THRESHOLD = 0.3
-"""Place of the threshold between the levels of noise (0) and of beats (1)."""
-STRANGE_THRESHOLD, STRANGE_LATE = 0.36, 0.20
-"""The same for waves that do not look like the usual beat, P waves and noise among them; and where
-a beat is overdue."""
-VERY_ALIKE = 0.9
-"""Correlation with the usual shape above which a low wave does look like the usual beat."""
+ventricle beats twice in that time; up to the second time, if it was duller for its height, too.
+Unless it is just like a beat and came when one was due: a tug at the electrode may follow a small
+beat. P waves come too soon, and are 0.90 to 0.98 like beats."""
 PATIENCE_S = 0.3
 """A low wave is taken for a missed beat no sooner: it may be the P wave of a beat to come."""
 OVERDUE = 1.5
@@ -155,15 +158,16 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
     first = max(0, middle - plan.length + 4 * plan.half)
     clear = False
     for k in range(len(s.leads)):
-        level, noise = wave_levels(k, first, middle, plan, s)
+        level, noise, lone = wave_levels(k, first, middle, plan, s)
         s.leads[k, LEVEL] = level
         s.leads[k, NOISE] = max(noise, 0.02 * level)
-        clear = clear or level > CLEAR * noise
+        clear = clear or (level > CLEAR * noise and not lone)
     # A slow heart may not have beaten yet.
     s.counters[LEARN_AT] = s.counters[SEEN] + int(LOOK_S * plan.rate_hz) - plan.learn
     if not clear and (middle - first < MOST_S * plan.rate_hz or s.leads[:, LEVEL].max() <= 0.0):
         return
     s.counters[LEARNT] = 1
+    learn_stature(first, middle, plan, s)
     # A record may begin with a beat; none is overdue yet.
     s.counters[LAST_BEAT] = first - int(T_WAVE_S * plan.rate_hz)
     for i in range(first, middle + 1):
@@ -216,18 +220,22 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
     since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
     low = s.numbers[LAST_HEIGHT] < LOW and not _was_due(at, s)
-    ahead = since_s < AHEAD_S and s.counters[BEATS] > 1 and low
+    ahead = since_s < LONG_AHEAD_S and s.counters[BEATS] > 1 and low
     if since_s < REFRACTORY_S and not ahead:
         return
     # Leads that turned out to be lost since then no longer count.
     _refuse_knocks(at, plan, s)
     height = _height(at, plan, s)
+    measure_stature(at, plan, s)
     instead = ahead and height > AHEAD * s.numbers[LAST_HEIGHT]
+    if instead and since_s >= AHEAD_S:
+        sharp = s.numbers[LAST_TALL] * s.numbers[STEEP_NOW]
+        instead = s.numbers[LAST_STEEP] * s.numbers[TALL_NOW] < DULL * sharp
     if instead:
         since_s = (at - s.before.counters[LAST_BEAT]) / plan.rate_hz
     if since_s < REFRACTORY_S:
         return
-    if _is_beat(since_s, height, 1.0, plan, s) and _resembles(at, height, 1.0, plan, s):
+    if is_beat(since_s, height, 1.0, plan, s) and resembles(at, height, 1.0, plan, s):
         if instead:
             _take_back(s)
             measure_beat(at, s.found[s.counters[FOUND]], plan, s)
@@ -237,6 +245,7 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     s.numbers[BETWEEN] += 0.125 * (min(height, 0.6) - s.numbers[BETWEEN])
     kept = s.counters[WAITING] % KEPT_WAVES
     s.waves[kept, 0], s.waves[kept, 1] = at, height
+    s.waves[kept, 2], s.waves[kept, 3] = s.numbers[STEEP_NOW], s.numbers[TALL_NOW]
     s.counters[WAITING] += 1
 
 
@@ -253,7 +262,7 @@ def _take_back(s: State) -> None:
     """The last beat was none: know what was known before it, and that such a wave is no beat."""
     low = min(s.numbers[LAST_HEIGHT], 0.6)
     s.numbers[BETWEEN] += 0.25 * max(low - s.numbers[BETWEEN], 0.0)
-    for number in (LAST_HEIGHT, LAST_LIKENESS, USUAL_RR):
+    for number in (LAST_HEIGHT, LAST_LIKENESS, LAST_STEEP, LAST_TALL, USUAL_RR):
         s.numbers[number] = s.before.numbers[number]
     for counter in (LAST_BEAT, BEATS, INTERVALS, STRANGE):
         s.counters[counter] = s.before.counters[counter]
@@ -287,42 +296,21 @@ def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
 
 
 @compiled
-def _is_beat(since_s: float, height: float, share: float, plan: Plan, s: State) -> bool:
-    """Whether a wave so long after a beat and so high exceeds a share of the threshold."""
-    between, last = s.numbers[BETWEEN], s.numbers[LAST_HEIGHT]
-    slow = math.sqrt(max(s.numbers[USUAL_RR] / (USUAL_S * plan.rate_hz), 1.0))
-    bar_s = LATE_T_WAVE_S if share < 1.0 else min(T_WAVE_S * slow, LATE_T_WAVE_S)
-    bar = 0.5 * min(last, LARGE)
-    if since_s >= bar_s:
-        wide = s.numbers[LAST_LIKENESS] < ALIKE or last > LARGE
-        bar *= 1.0 - (since_s - bar_s) / FADE_S if wide else 0.0
-    if height < bar:
-        return False
-    return bool(height > between + share * THRESHOLD * (1.0 - between))
-
-
-@compiled
-def _resembles(at: int, height: float, share: float, plan: Plan, s: State) -> bool:
-    """Measure a wave that may be a beat: does it look like one, or is it high enough besides?"""
-    row, between = s.found[s.counters[FOUND]], s.numbers[BETWEEN]
-    measure_beat(at, row, plan, s)
-    strange = between + (STRANGE_THRESHOLD if share == 1.0 else STRANGE_LATE) * (1.0 - between)
-    return bool(row[LIKENESS] >= VERY_ALIKE or height > strange)
-
-
-@compiled
 def _look_back(i: int, plan: Plan, s: State) -> None:
     """A beat is overdue: take the highest wave since the last one, or lower the levels."""
     best = -1
     for k in range(min(s.counters[WAITING], KEPT_WAVES)):
         since_s = (s.waves[k, 0] - s.counters[LAST_BEAT]) / plan.rate_hz
         fits = since_s >= REFRACTORY_S and i - s.waves[k, 0] >= PATIENCE_S * plan.rate_hz
-        fits = fits and _is_beat(since_s, s.waves[k, 1], 0.5, plan, s)
+        s.numbers[STEEP_NOW], s.numbers[TALL_NOW] = s.waves[k, 2], s.waves[k, 3]
+        fits = fits and is_beat(since_s, s.waves[k, 1], 0.5, plan, s)
         if fits and (best < 0 or s.waves[k, 1] > s.waves[best, 1]):
             best = k
     if best >= 0:
         at, height = int(s.waves[best, 0]), s.waves[best, 1]
-        if _resembles(at, height, 0.5, plan, s):
+        # Of a wave that is kept only the sum over all leads is known.
+        measure_stature(at, plan, s)
+        if resembles(at, height, 0.5, plan, s):
             s.found[s.counters[FOUND], INSTEAD] = 0.0
             _accept(at, height, 1.0, plan, s)
             return
@@ -353,32 +341,40 @@ def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
         # A lead that is off says nothing about how large its beats are.
         if lead[WEIGHT] <= 0.0:
             continue
-        level, noise = wave_levels(k, first, last, plan, s)
+        level, noise, _ = wave_levels(k, first, last, plan, s)
         if level > CLEAR * noise:
-            lead[LEVEL], lead[NOISE] = max(level, least * lead[LEVEL]), noise
+            level = max(level, least * lead[LEVEL])
+            for column in (TALL, STEEP):
+                lead[column] *= level / lead[LEVEL] if lead[LEVEL] > 0.0 else 0.0
+            lead[LEVEL], lead[NOISE] = level, noise
 
 
 @compiled
 def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
     """A beat: time it, learn from it, and report it."""
-    row = s.found[s.counters[FOUND]]
+    row, anew = s.found[s.counters[FOUND]], towers(height, s)
     _keep(s)
     _learn_interval(at, plan, s)
     s.counters[LAST_BEAT] = at
     s.numbers[LAST_HEIGHT], s.numbers[LAST_LIKENESS] = height, row[LIKENESS]
+    s.numbers[LAST_STEEP], s.numbers[LAST_TALL] = s.numbers[STEEP_NOW], s.numbers[TALL_NOW]
     kept = 0
     for k in range(min(s.counters[WAITING], KEPT_WAVES)):
         if s.waves[k, 0] > at:
-            s.waves[kept, 0], s.waves[kept, 1] = s.waves[k, 0], s.waves[k, 1]
+            s.waves[kept, :] = s.waves[k, :]
             kept += 1
     s.counters[WAITING] = kept
     contrast = 0.0
+    if anew:
+        s.counters[INTERVALS], s.numbers[USUAL_RR] = 0, plan.rate_hz
     for k in range(len(s.leads)):
+        if anew:
+            s.leads[k, LEVEL] = max(s.leads[k, LEVEL], s.energy[k, at % plan.length])
         learn_level(s.leads[k], s.energy[k, at % plan.length], late)
         if s.leads[k, WEIGHT] > 0.0:
             contrast = max(contrast, s.leads[k, LEVEL] / s.leads[k, NOISE])
     row[KNOWN], row[HEIGHT], row[LATE] = s.counters[SEEN] - 1, height, late
-    learn_beat(at, row, plan, s)
+    learn_beat(at, row, anew, plan, s)
     s.counters[FOUND] += 1
     if contrast < UNCLEAR and at - s.counters[LEARN_AT] > RECENT_S * plan.rate_hz:
         _learn_again(at - int(RECENT_S * plan.rate_hz), at, plan, s)

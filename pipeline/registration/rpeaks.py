@@ -194,7 +194,7 @@ def _state(plan: Plan, leads: int) -> State:
     counters[at.USABLE] = 1
     numbers = np.zeros(at.NUMBERS)
     numbers[[at.BEST, at.LAST_HEIGHT, at.BETWEEN, at.USUAL_RR]] = -1, 1, 0.1, plan.rate_hz
-    numbers[at.LAST_LIKENESS] = 1
+    numbers[[at.LAST_LIKENESS, at.LAST_STEEP, at.LAST_TALL]] = 1
     rows, shapes = np.zeros((leads, at.LEAD_FIELDS)), np.zeros((leads, at.SHAPE_POINTS))
     intervals = np.zeros(at.KEPT_INTERVALS)
     rows[:, [at.SMALLEST_STEP, at.LOWEST, at.LOWEST_OLD, at.LOWEST_OLDER, at.STILLEST]] = np.inf
@@ -202,7 +202,7 @@ def _state(plan: Plan, leads: int) -> State:
         even, odd, _bell(_COARSE_S, plan.rate_hz), _bell(_FINE_S, plan.rate_hz),
         raw=np.zeros((leads, 2 * plan.length)), power=np.zeros((leads, 2 * plan.length)),
         energy=np.zeros((leads, plan.length)), fused=np.zeros(plan.length),
-        waves=np.zeros((at.KEPT_WAVES, 2)), intervals=intervals,
+        waves=np.zeros((at.KEPT_WAVES, 4)), intervals=intervals,
         leads=rows, shapes=shapes, seen=np.zeros((leads, at.SHAPE_POINTS)),
         found=np.zeros((64, at.FIELDS)), counters=counters, numbers=numbers,
         before=at.Learnt(

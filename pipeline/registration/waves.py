@@ -25,7 +25,11 @@ from pipeline.registration.detector_state import (
     SHAPE_POINTS,
     SHIFT,
     SIGN,
+    STEEP,
+    STEEP_HERE,
     STRANGE,
+    TALL,
+    TALL_HERE,
     TIME,
     TIMED,
     WAY,
@@ -49,6 +53,8 @@ ALIKE = 0.75
 """Correlation with the usual shape above which a beat has that shape."""
 FORGET_SHAPE = 8
 """After so many beats in succession of other shapes the last one is the usual one."""
+GROW, SHRINK = 0.3, 0.03
+"""Shares by which usual height and steepness follow a beat that is taller or steeper, and less."""
 _OTHER_WAY = 0.13
 """A deflection against a lead's usual direction is the main one of a beat of another shape if it is
 larger by this share of the sum of both."""
@@ -174,15 +180,15 @@ def measure_beat(at: int, row: Float, plan: Plan, s: State) -> None:
 
 
 @compiled
-def learn_beat(at: int, row: Float, plan: Plan, s: State) -> None:
-    """Let what is usual follow the beat that was measured last."""
+def learn_beat(at: int, row: Float, anew: bool, plan: Plan, s: State) -> None:
+    """Let what is usual follow the beat that was measured last, or be that beat."""
     if at < BEFORE_S * plan.rate_hz:
         # The record began within this beat.
         return
     usual = row[LIKENESS] >= ALIKE
     s.counters[STRANGE] = 0 if usual else s.counters[STRANGE] + 1
-    if usual or s.counters[STRANGE] >= _patience(s):
-        _learn_shapes(row[TIME] * plan.rate_hz - at, plan, s)
+    if anew or usual or s.counters[STRANGE] >= _patience(s):
+        _learn_shapes(row[TIME] * plan.rate_hz - at, anew or not usual, plan, s)
 
 
 @compiled
@@ -272,9 +278,8 @@ def _lower_median(s: State) -> float:
 
 
 @compiled
-def _learn_shapes(together: float, plan: Plan, s: State) -> None:
-    """Let the usual shape, direction and offset of every lead follow this beat."""
-    anew = s.counters[STRANGE] > 0
+def _learn_shapes(together: float, anew: bool, plan: Plan, s: State) -> None:
+    """Let the usual shape, direction and offset of every lead follow this beat, or be its own."""
     for k in range(len(s.leads)):
         lead = s.leads[k]
         if lead[WEIGHT] <= 0.0:
@@ -284,6 +289,7 @@ def _learn_shapes(together: float, plan: Plan, s: State) -> None:
         elif lead[SIGN] != lead[WAY]:
             continue
         _learn_size(lead, plan)
+        _learn_stature(lead, anew)
         lead[TIMED] = min(lead[TIMED] + 1.0, 64.0)
         share = max(1.0 / lead[TIMED], 0.02)
         lead[LEAN] += share * (lead[LEAN_NOW] - lead[LEAN])
@@ -308,6 +314,17 @@ def _learn_size(lead: Float, plan: Plan) -> None:
     lead[SCATTER] += 0.1 * (min(abs(lead[FINER] - lead[SHIFT]), limit) - lead[SCATTER])
     lead[SHIFT] += 0.1 * min(max(lead[FINER] - lead[SHIFT], -limit), limit)
     lead[SIZE_MV] += 0.1 * (lead[HEIGHT_MV] - lead[SIZE_MV])
+
+
+@compiled
+def _learn_stature(lead: Float, anew: bool) -> None:
+    """How tall and steep beats are; slowly downwards, for low waves may turn out to be none."""
+    for usual, here in ((TALL, TALL_HERE), (STEEP, STEEP_HERE)):
+        if anew or lead[usual] <= 0.0:
+            lead[usual] = lead[here]
+        else:
+            away = lead[here] - lead[usual]
+            lead[usual] += (GROW if away > 0.0 else SHRINK) * away
 
 
 @compiled
