@@ -219,7 +219,8 @@ def query(
         print(json.dumps(answers))
         return 0
     for name, answer in answers.items():
-        force = " ".join(f"{value:+.4f}" for value in answer["force_n"])
+        # No force has no sign.
+        force = " ".join(f"{round(value, 4) + 0.0:+.4f}" for value in answer["force_n"])
         print(
             f"{name}: distance {answer['distance_mm']:+.3f} mm, "
             f"potential {answer['potential']:.4f}, force {force} N{_limits(answer)}"

@@ -125,7 +125,8 @@ def _heart(study: SyntheticStudy) -> dict[str, Any]:
     phases = np.arange(CURVE_POINTS) / CURVE_POINTS
     graph = as_svg(curves.volume_curves(phases, volume_curves_ml(study.heart, phases)))
     pictures.append(_picture(graph, "volumes enclosed by the truth meshes", "svg+xml"))
-    note = "" if drawn else "This machine cannot draw in three dimensions: surfaces are left out."
+    missing = "Nothing could be drawn in three dimensions here, or not in two minutes."
+    note = "" if drawn else f"{missing} Surfaces are left out."
     return {"title": "The heart", "note": note, "pictures": pictures, "is_heart": True}
 
 
