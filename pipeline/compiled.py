@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-from numba import config
+from numba import config, njit
 
 
 @contextmanager
@@ -27,11 +30,37 @@ def kept_with(folder: Path, names: Sequence[str]) -> Iterator[None]:
         of the numbers that they take for constants.
     """
     usual = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(usual or folder / "__pycache__") / _digest(folder, *names))
+    config.CACHE_DIR = str(Path(usual or _place(folder)) / _digest(folder, *names))
     try:
         yield
     finally:
         config.CACHE_DIR = usual
+
+
+def door(folder: Path, names: Sequence[str], **options: Any) -> Callable[[Any], Any]:
+    """A decorator that compiles as numba's options say, and keeps what it made with its sources."""
+
+    def compiled(function: Any) -> Any:
+        with kept_with(folder, names):
+            return njit(**options)(function)
+
+    return compiled
+
+
+@cache
+def _place(folder: Path) -> Path:
+    """Beside the sources or, where those may not be written, among the user's caches.
+
+    Left to itself the compiler would go there too, but to one place for sources of all kinds.
+    """
+    beside = folder / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        tempfile.TemporaryFile(dir=beside).close()
+    except OSError:
+        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        return Path(caches) / "beatfield"
+    return beside
 
 
 @cache

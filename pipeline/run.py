@@ -29,7 +29,6 @@ from pipeline.publish import (
     require_unaltered,
     seal,
     sealed,
-    sha256_of,
     write_json,
 )
 from pipeline.study import Study
@@ -126,7 +125,7 @@ def run_study(
     wanted = STAGES[: STAGE_NAMES.index(last) + 1] if last else STAGES
     forced = STAGE_NAMES[STAGE_NAMES.index(first) :] if first else ()
     with only_run_in(products):
-        inputs = _input_digests(study)
+        inputs = study.input_digests()
         _require_same_study(study, inputs, products)
         run = _Run(study, settings, products, watcher, inputs, _earlier_stages(products))
         try:
@@ -180,11 +179,17 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     run.watcher.ended(stage.name, "done", seconds)
 
 
+def _is_settled(run: _Run, stage: Stage) -> bool:
+    """Whether an earlier run made of the same what there is to make, if only a reason for none."""
+    key, standing = _fingerprint(run, stage), sealed(run.products / stage.name)
+    if standing:
+        return bool(standing["fingerprint"] == key)
+    return _skipped_before(run, stage, key) is not None
+
+
 def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
     """Refuse at once what the stage register would refuse minutes later, if it is to run."""
-    standing = sealed(run.products / register.name)
-    done = standing and standing["fingerprint"] == _fingerprint(run, register) and not force
-    if done or run.study.us is None:
+    if run.study.us is None or (not force and _is_settled(run, register)):
         return
     module = importlib.import_module(f"pipeline.stages.{register.name}")
     clock = time.perf_counter()
@@ -256,8 +261,23 @@ def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
     with publishing(target) as folder:
         job = Job(run.study, run.settings, run.products, folder, run.watcher.progress)
         figures: dict[str, Any] = module.run(job)
+        _require_inputs_of_the_start(run, stage)
         seal(folder, key, figures)
     return figures
+
+
+def _require_inputs_of_the_start(run: _Run, stage: Stage) -> None:
+    """Refuse what was made of files that changed since the run began: a later run with the files
+    of the start would take it for theirs."""
+    now = run.study.input_digests(stage.inputs)
+    for kind in stage.inputs:
+        changed = dict(run.inputs[kind].items() ^ now[kind].items())
+        if changed:
+            raise InputError(
+                f"{run.study.folder / min(changed)}: changed while the study ran, so nothing is "
+                f"made of it by the stage {stage.name}, which needs the files that the run began "
+                "with; wait until nobody writes to the study, then run it again"
+            )
 
 
 def _fingerprint(run: _Run, stage: Stage) -> str:
@@ -290,18 +310,6 @@ def _described(study: Study, stage: Stage) -> dict[str, Any]:
     if "us" in stage.inputs and study.us:
         says["us"] = study.us.model_dump(exclude={"sweeps"})
     return says
-
-
-def _input_digests(study: Study) -> dict[str, dict[str, str]]:
-    return {
-        kind: {
-            path.relative_to(study.folder).as_posix()
-            if path.is_relative_to(study.folder)
-            else path.as_posix(): sha256_of(path)
-            for path in paths
-        }
-        for kind, paths in study.input_files().items()
-    }
 
 
 def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], products: Path) -> None:

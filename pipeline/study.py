@@ -7,6 +7,7 @@ elsewhere, key by key. Nothing here reads an image.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
+from pipeline.publish import sha256_of
 from pipeline.study_files import files_below, names_in_header, record_files, sweep_files
 from pipeline.validation import describe_validation
 from pipeline.yaml_files import read_yaml
@@ -109,6 +111,19 @@ class Study(Described):
             "mr_ecg": record_files(self.ecg.mr),
             "us": us,
             "truth": files_below(self.truth) if self.truth else [],
+        }
+
+    def input_digests(self, kinds: Sequence[str] | None = None) -> dict[str, dict[str, str]]:
+        """SHA-256 of the input files by kind and path, of all kinds or of some."""
+        return {
+            kind: {
+                path.relative_to(self.folder).as_posix()
+                if path.is_relative_to(self.folder)
+                else path.as_posix(): sha256_of(path)
+                for path in paths
+            }
+            for kind, paths in self.input_files().items()
+            if kinds is None or kind in kinds
         }
 
 

@@ -254,10 +254,10 @@ def test_the_summary_says_what_the_registration_is_worth(
     record = {"status": "done", "stages": {"register": stage}}
     assert f"verdict   registration {line}" in summary(record, tmp_path).splitlines()
     assert "clock" not in summary(record, tmp_path)
-    stage["figures"] |= {"us_clock_applied_s": -0.3}
-    assert "clock     ultrasound 0.300 s behind its ECG, which" in summary(record, tmp_path)
+    stage["figures"] |= {"us_clock_applied_s": -0.11}
+    assert "clock     ultrasound 0.110 s behind its ECG, which" in summary(record, tmp_path)
     assert "the MR's phases that do not begin" in summary(record, tmp_path)
-    stage["figures"] |= {"us_clock_applied_s": 0.06}
+    stage["figures"] |= {"us_clock_applied_s": 0.09}
     assert "the MR's phases that do not begin" not in summary(record, tmp_path)
     stage["status"] = "stale"
     assert "verdict" not in summary(record, tmp_path)
@@ -308,7 +308,10 @@ def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Pa
     ("phase", "ejection", "odd"),
     [
         (0.44, 0.6, False),
-        (0.30, 0.6, False),
+        (0.28, 0.6, False),
+        (0.26, 0.6, True),
+        (0.58, 0.6, False),
+        (0.60, 0.6, True),
         (0.16, 0.6, True),
         (0.96, 0.6, True),
         (0.16, 0.1, False),

@@ -57,3 +57,21 @@ def test_a_changed_source_has_a_place_of_its_own(tmp_path, monkeypatch):
     assert places[0] != places[1]
     assert all(Path(place).parent == tmp_path / "kept" for place in places)
     assert str(tmp_path / "kept") == config.CACHE_DIR
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_a_folder_that_may_not_be_written_keeps_sources_apart_too(tmp_path, monkeypatch, writable):
+    """As of a package that another user installed: there the compiler has one place for all."""
+    from numba import config
+
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "mine"))
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "one.py").write_text("")
+    if not writable:
+        (folder / "__pycache__").write_text("no folder")
+    with kept_with(folder, ("one",)):
+        place = Path(config.CACHE_DIR)
+    assert place.name.startswith("numba-")
+    assert place.parent == (folder / "__pycache__" if writable else tmp_path / "mine" / "beatfield")

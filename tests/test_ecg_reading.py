@@ -15,7 +15,7 @@ from pydicom.sequence import Sequence
 from pydicom.uid import ExplicitVRLittleEndian
 
 from pipeline.errors import InputError
-from pipeline.imaging.ecg import other_patient, read_ecg
+from pipeline.imaging.ecg import other_patient, patient_mark, read_ecg
 
 RATE_HZ = 250.0
 # Every value is a whole number of the 1 microvolt steps of the files below.
@@ -156,14 +156,17 @@ def test_dicom_waveform_is_read_in_millivolts(tmp_path):
 
 def test_an_ecg_of_another_patient_than_the_cine_is_told(tmp_path):
     path = write_dicom(tmp_path / "ecg.dcm")
-    assert other_patient(read_ecg(path), "4711", path) == []
+    assert other_patient(read_ecg(path), patient_mark("4711"), path) == []
     with pydicom.dcmread(path) as dataset:
         dataset.PatientID = " 4712"
         dataset.save_as(tmp_path / "named.dcm")
     named = read_ecg(tmp_path / "named.dcm")
-    assert other_patient(named, "4712", path) == other_patient(named, "", path) == []
-    [told] = other_patient(named, "4711", path)
-    assert told.startswith(f"{path} has the PatientID '4712', the cine '4711': make sure")
+    for mark in (patient_mark("4712"), patient_mark("")):
+        assert other_patient(named, mark, path) == []
+    [told] = other_patient(named, patient_mark("4711"), path)
+    assert told.startswith(f"{path} has another PatientID than the cine: make sure")
+    # Reports are shown to others.
+    assert "471" not in told.removeprefix(str(path)) + patient_mark("4711")
 
 
 def test_dicom_samples_that_stand_for_none_are_a_gap(tmp_path):
@@ -176,6 +179,9 @@ def test_dicom_samples_that_stand_for_none_are_a_gap(tmp_path):
         read_ecg(path)
     found_mv = read_ecg(path, gaps=True).signal_mv
     np.testing.assert_array_equal(np.isnan(found_mv), steps == -32768)
+    # Zero is a voltage, whatever a file says.
+    group.WaveformPaddingValue = b"\x00\x00"
+    assert np.isfinite(read_ecg(write_dicom(tmp_path / "zero.dcm", [group])).signal_mv).all()
 
 
 def test_dicom_recording_is_preferred_to_the_averaged_beat(tmp_path):

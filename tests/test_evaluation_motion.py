@@ -232,6 +232,16 @@ def test_truth_of_another_cine_is_refused(job: Job) -> None:
         evaluate.run(job)
 
 
+def test_truth_in_another_place_or_order_is_refused(job: Job) -> None:
+    """Of another patient with as many slices, or of a stack that is stored mirrored."""
+    assert job.study.truth is not None
+    mirrored = np.diag([-1.0, 1, 1, 1])
+    mirrored[0, 3] = 7
+    write_labels(job.study.truth, "labels", np.zeros((2, 3, 8, 8), np.uint8), mirrored)
+    with pytest.raises(InputError, match=r"up to 7\.0 mm beside those found.*one study"):
+        evaluate.run(job)
+
+
 def test_a_chamber_without_a_surface_has_no_ejection_fraction(job: Job) -> None:
     for path in (job.products / "surface").glob("rv_*"):
         path.unlink()

@@ -11,6 +11,7 @@ from field_shapes import beating, box, sphere
 
 from data_synth.population import draw_heart
 from pipeline.config import Settings
+from pipeline.errors import InputError
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
@@ -161,3 +162,12 @@ def test_a_motion_that_carries_all_points_out_of_the_grid_meanwhile_is_baked(tmp
         SETTINGS.model_copy(update={"fit_rounds": 2}), rr_s=RR_S,
     )  # fmt: skip
     assert said["surface_error_p99_mm"] < 0.25 * SETTINGS.spacing_mm
+
+
+def test_points_that_no_triangle_has_are_refused(tmp_path):
+    """The field would be bent towards them."""
+    ball = sphere(15.0, 2)
+    stray = Surface(np.vstack([ball.vertices_mm, [30.0, 0, 0]]), ball.triangles)
+    moving = {"ball": beating(stray, np.array([1.0, 0.9, 0.95]), np.array([0.0, 0.3, 0.6]))}
+    with pytest.raises(InputError, match=r"ball.*1 vertices belong to no triangle.*number 162"):
+        bake_field(tmp_path / "field.zarr", moving, {"guide": FIXTURES["guide"]}, SETTINGS)

@@ -356,31 +356,45 @@ def test_any_description_is_survived(path, watched, tmp_path):
         assert done.stderr == b""
 
 
+def described(path, target, change):
+    """A copy whose description was changed, sealed again."""
+    shutil.copytree(path, target)
+    content = json.loads((target / "zarr.json").read_text())
+    change(content["attributes"]["beatfield"])
+    (target / "zarr.json").write_text(json.dumps(content))
+    (target / "manifest.json").unlink()
+    write_manifest(target)
+    return target
+
+
 def test_a_force_that_python_rounds_to_the_devices_is_taken(path, program, tmp_path):
-    def round_up(folder):
-        content = json.loads((folder / "zarr.json").read_text())
-        for fixture in content["attributes"]["beatfield"]["fixtures"].values():
+    def round_up(field):
+        for fixture in field["fixtures"].values():
             fixture["f_max_n"] = fixture["device_limits"]["force_n"] * (1 + 1e-10)
             fixture["delta_mm"] = 20.0
-        (folder / "zarr.json").write_text(json.dumps(content))
-        (folder / "manifest.json").unlink()
-        write_manifest(folder)
 
-    other = damaged(path, tmp_path / "f.zarr", round_up)
-    force_n = np.linalg.norm(ForceField.open(other).force_at(25.0, 5, 3, 0.4, "stay_in"))
-    assert force_n > 0
+    other = described(path, tmp_path / "f.zarr", round_up)
+    assert any(ForceField.open(other).force_at(25.0, 5, 3, 0.4, "stay_in"))
     assert run(program, other, given=np.array([10.0, 5, 3, 0.4]).tobytes()).returncode == 0
 
 
+@pytest.mark.parametrize("share", [0.999, 1 + 1e-10, 1.001, 0.0, None])
+def test_a_fixture_stiffer_than_its_device_is_refused_as_in_python(path, program, tmp_path, share):
+    def limit(field):
+        for fixture in field["fixtures"].values():
+            fixture["device"], own = "mine", fixture["stiffness_n_per_m"]
+            fixture["device_limits"]["stiffness_n_per_m"] = share and own / share
+
+    other = described(path, tmp_path / "f.zarr", limit)
+    code = run(program, other, given=np.array([10.0, 5, 3, 0.4]).tobytes()).returncode
+    assert (code == 0) == (share is None or 0 < share < 1.0005)
+
+
 def test_metadata_is_understood_whatever_the_order_of_its_keys(path, program, tmp_path):
-    def reorder(folder):
-        content = json.loads((folder / "zarr.json").read_text())
-        field = content["attributes"]["beatfield"]
-        content["attributes"]["beatfield"] = dict(sorted(field.items()))
-        (folder / "zarr.json").write_text(json.dumps(content))
-        (folder / "manifest.json").unlink()
-        write_manifest(folder)
+    def reorder(field):
+        for key in sorted(field):
+            field[key] = field.pop(key)
 
     question = np.array([10.0, 5, 3, 0.4]).tobytes()
-    other = damaged(path, tmp_path / "f.zarr", reorder)
+    other = described(path, tmp_path / "f.zarr", reorder)
     assert run(program, other, given=question).stdout == run(program, path, given=question).stdout

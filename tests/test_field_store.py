@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pipeline.errors import InputError
 from pipeline.field import ForceField
 from pipeline.field.manifest import canonical_manifest, write_manifest
+from pipeline.field.potential import offence, potential
 from pipeline.field.store import verify_field
 
 
@@ -188,6 +189,9 @@ def test_added_files_are_found(copy):
             "guide: phase 0 is not the formula",
         ),
         (lambda b: b["fixtures"]["guide"].update(structure="x"), "no structure 'x'"),
+        (lambda b: b["grid"].update(origin_mm=[9.0, 0.0, 0.0]), "ome and beatfield disagree"),
+        (lambda b: b["grid"].update(spacing_mm=[2.7] * 3), "ome and beatfield disagree"),
+        (lambda b: b.update(rr_s=800.0), "ome and beatfield disagree"),
     ],
 )
 def test_sealed_but_wrong_descriptions_are_found(copy, change, words):
@@ -230,6 +234,40 @@ def test_sealed_values_that_are_no_numbers_are_found(copy, array):
     edit(copy, lambda described: None)
 
     with pytest.raises(InputError, match=f"{array}: phase 3"):
+        verify_field(copy)
+
+
+def rewrite(path: Path, change, arrays=("distance/ball", "spline/ball")) -> None:
+    """Change the values of all phases, potentials by the formula, and seal the store again."""
+    laws = [f"potential/{name}" for name in ("guide", "stay_in")]
+    for array in (*arrays, *laws):
+        chunks = [path / array / "c" / str(k) / "0" / "0" / "0" for k in range(len(PHASES))]
+        before = np.stack([np.fromfile(chunk, dtype="<f4") for chunk in chunks])
+        if array in laws:
+            law = ForceField.open(path).fixtures[array.removeprefix("potential/")]
+            ball = path / "distance" / "ball"
+            sources = [ball / chunk.relative_to(path / array) for chunk in chunks]
+            distance_mm = np.stack([np.fromfile(source, dtype="<f4") for source in sources])
+            offence_mm = offence(distance_mm.astype(float), law.side_code)
+            after = potential(offence_mm, law.resolved_delta_mm, law.m)
+        else:
+            after = change(before)
+        for chunk, values in zip(chunks, after, strict=True):
+            values.astype("<f4").tofile(chunk)
+    edit(path, lambda described: None)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda mm: -mm, r"distance/ball: phase 0 is negative over .* its surface encloses"),
+        (lambda mm: mm - 3, r"distance/ball: phase 2 is negative over .* its surface encloses"),
+        (lambda mm: 1.1 * mm, r"phase 0 changes by 3\.\d+ mm between nodes that lie 3 mm apart"),
+    ],
+)
+def test_sealed_values_that_are_no_distances_to_the_surface_are_found(copy, change, words):
+    rewrite(copy, change)
+    with pytest.raises(InputError, match=words):
         verify_field(copy)
 
 

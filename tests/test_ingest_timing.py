@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,20 @@ from pipeline.study import open_study
 PHASES, SLICES = 10, 4
 
 
-def remarks_of(folder: Path, rr_ms: float, ecg_rr_s: float | None, shown: float = 1.0) -> list[str]:
+def remarks_of(
+    folder: Path,
+    rr_ms: float,
+    ecg_rr_s: float | None,
+    shown: float = 1.0,
+    count: int = PHASES,
+) -> list[str]:
     """Remarks on noise whose phases are spread evenly over a share of beats of ``rr_ms``."""
     for name in ("cine", "ecg", "out"):
         (folder / name).mkdir()
     rng = np.random.default_rng(2)
-    pixels = rng.normal(100, 20, (PHASES, SLICES, 48, 48)).astype(np.float32)
+    pixels = rng.normal(100, 20, (count, SLICES, 48, 48)).astype(np.float32)
     write_image(folder / "cine" / "cine.nii.gz", pixels, np.diag([2.0, 2.0, 8.0, 1.0]))
-    times_ms = (shown * rr_ms * np.arange(PHASES) / PHASES).tolist()
+    times_ms = (shown * rr_ms * np.arange(count) / count).tolist()
     timing = {"trigger_times_ms": times_ms, "rr_ms": rr_ms}
     (folder / "cine" / "timing.json").write_text(json.dumps(timing))
     if ecg_rr_s is not None:
@@ -50,6 +57,20 @@ def test_gating_that_waits_for_the_next_peak_raises_none(tmp_path: Path) -> None
     assert remarks_of(tmp_path, 800.0, None, shown=0.85) == []
 
 
+def test_few_phases_that_share_the_beat_evenly_raise_none(tmp_path: Path) -> None:
+    assert remarks_of(tmp_path, 800.0, None, count=3) == []
+
+
+def test_an_ecg_of_another_patient_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read_cine, read_ecg = ingest.read_nifti_cine, ingest.read_ecg
+    monkeypatch.setattr(
+        ingest, "read_nifti_cine", lambda *given: replace(read_cine(*given), patient="A17")
+    )
+    monkeypatch.setattr(ingest, "read_ecg", lambda path: replace(read_ecg(path), patient="B4"))
+    [told] = remarks_of(tmp_path, 800.0, 0.8)
+    assert "has another PatientID than the cine" in told
+
+
 def test_a_beat_of_which_half_is_not_shown_is_told(tmp_path: Path) -> None:
     """As of an RR interval of two beats, or cine.rr_ms of another examination."""
     [told] = remarks_of(tmp_path, 1600.0, None, shown=0.5)
@@ -57,6 +78,6 @@ def test_a_beat_of_which_half_is_not_shown_is_told(tmp_path: Path) -> None:
 
 
 def test_an_ecg_of_another_heart_rate_is_told(tmp_path: Path) -> None:
-    [told] = remarks_of(tmp_path, 1200.0, 0.8)
-    assert told.startswith("the cine's RR interval is 1200 ms, that of ")
+    [told] = remarks_of(tmp_path, 1100.0, 0.8)
+    assert told.startswith("the cine's RR interval is 1100 ms, that of ")
     assert "ms: either timing is wrong, or the ECG is of another" in told

@@ -27,6 +27,7 @@ from pipeline import run as runner
 from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import MovingSurface
 from pipeline.job import Skipped
+from pipeline.products import FrameRow, read_frames, write_frames
 from pipeline.registration import space
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
@@ -276,17 +277,26 @@ class TestRefusals:
             ("before", False, "a sweep", True),
             (None, False, "a sweep", True),
             (None, False, None, False),
+            ("skipped now", False, "a sweep", False),
+            ("skipped now", True, "a sweep", True),
+            ("skipped before", False, "a sweep", True),
         ],
     )
     def test_ultrasound_is_looked_at_first_only_where_it_will_be_registered(
         self, monkeypatch, made, force, us, looked_at
     ):
         seen = []
-        monkeypatch.setattr(runner, "sealed", lambda _: made and {"fingerprint": made})
+        _, skipped, when = (made or "").rpartition("skipped ")
+        earlier = {"status": "skipped", "cause": "no place fits", "fingerprint": when}
+        sealed = None if skipped or not made else {"fingerprint": made}
+        monkeypatch.setattr(runner, "sealed", lambda _: sealed)
         monkeypatch.setattr(runner, "_fingerprint", lambda *_: "now")
         monkeypatch.setattr(stage, "require_usable", lambda study, _: seen.append(study.us))
         run = SimpleNamespace(
-            products=Path(), study=SimpleNamespace(us=us), settings=SimpleNamespace(register_=None)
+            products=Path(),
+            study=SimpleNamespace(us=us),
+            settings=SimpleNamespace(register_=None),
+            before={"register": earlier} if skipped else {},
         )
         runner._require_ultrasound(run, runner.Stage("register"), force)
         assert bool(seen) == looked_at
@@ -345,3 +355,9 @@ def test_settings_refuse_what_contradicts_itself():
         RegisterSettings(min_frames=50, max_frames=20)
     with pytest.raises(ValueError, match="Extra inputs"):
         RegisterSettings(speed=3)
+
+
+def test_a_phase_that_rounds_to_one_is_written_as_the_next_beats_beginning(tmp_path):
+    rows = [FrameRow("first", n, 0.1, phase, 0.5, True) for n, phase in enumerate((0.9999999, 0.4))]
+    write_frames(tmp_path / "frames.csv", rows)
+    assert [row.phase for row in read_frames(tmp_path / "frames.csv")] == [0.0, 0.4]

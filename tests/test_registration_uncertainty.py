@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi
 
 from pipeline.geometry import transform_points
+from pipeline.registration import space
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.uncertainty import (
@@ -195,7 +198,7 @@ class TestVerdict:
             ({"confidence": 1.7}, "1.70 times"),
             ({"rival": 0.8}, "to 80%"),
             ({"valid": 20}, "20 of 48"),
-            ({"outvoted": (2,)}, "hardly any frame of sweep 2 bears out"),
+            ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
         ],
     )
     def test_each_weakness_makes_it_doubtful_and_is_named(self, change, reason):
@@ -222,13 +225,30 @@ class TestVerdict:
 
     @pytest.mark.parametrize(
         ("borne_out", "named"),
-        [((20, 0), (2,)), ((20, 2), (2,)), ((20, 3), ()), ((9, 0), ()), ((20, 20), ())],
+        [
+            ((20, 0), (2,)),
+            ((20, 5), (2,)),
+            ((20, 6), ()),
+            ((9, 0), ()),
+            ((10, 0), (2,)),
+            ((20, 20), ()),
+        ],
     )
     def test_a_sweep_that_contradicts_the_other_is_outvoted(self, borne_out, named):
         """As one whose calibration is another's: both cannot be right, and a pose says nothing."""
         sweep = np.repeat([0, 1, 2], [20, 20, 4])
         bears_out = np.concatenate([np.arange(20) < count for count in borne_out] + [np.zeros(4)])
         assert outvoted(sweep, bears_out.astype(bool), least=10) == named
+
+    def test_sweeps_of_a_registration_are_compared(self):
+        borne_out = np.arange(40) < 20
+        level = SimpleNamespace(samples=SimpleNamespace(frames=40, number=np.arange(40)))
+        found = SimpleNamespace(everything=level, bears_out=borne_out, confidence=2.0, rival=0.1)
+        search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
+        verdict = space._verdict(found, search, (20, 20), 1.0)
+        assert verdict.grade == "doubtful"
+        assert "frames of sweep 2 bear out" in verdict.reason
+        assert space._verdict(found, search, (40,), 1.0).grade == "good"
 
     def test_settings_refuse_bounds_that_cross(self):
         with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):

@@ -70,6 +70,17 @@ def test_a_small_beat_that_a_tug_follows_is_kept():
     assert lost.sum() <= 1
 
 
+def test_one_tug_among_the_first_beats_does_not_hide_low_ones():
+    """Only steep waves that come again show that what was found before them were P waves."""
+    rng = np.random.default_rng(5)
+    times_s, r_times_s = np.arange(40 * 360) / 360, 0.4 + np.arange(46) * 0.85
+    beats = [(at_s, scaled(NORMAL, 0.35)) for at_s in r_times_s]
+    beats.insert(5, (r_times_s[4] + 0.45, ((0.0, 0.005, 1.6, 1.0), (0.012, 0.005, -1.0, -0.6))))
+    signal = draw(rng, times_s, beats, noise_mv=0.01)
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    assert (matched(found_s, r_times_s) >= 0).all()
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_slow_heart_is_learnt_even_if_its_first_beat_comes_late(seed):
     # The first beat comes a whole interval after the start, in the third second.

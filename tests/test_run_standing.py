@@ -124,3 +124,24 @@ def test_a_stage_reads_no_product_that_it_is_not_made_from(stage: runner.Stage) 
     text = (Path(runner.__file__).parent / "stages" / f"{stage.name}.py").read_text()
     used = re.findall(r'products / "(\w+)"|job\.(?:product|figures)\("(\w+)"\)', text)
     assert {one or other for one, other in used} <= set(stage.after)
+
+
+def test_nothing_is_made_of_files_that_change_while_the_study_runs(kitchen: Kitchen) -> None:
+    """Put back afterwards, they would pass for what the product was made of."""
+    image = kitchen.folder / "cine" / "image"
+    kitchen.run()
+
+    def edited(job: Job) -> dict[str, Any]:
+        image.write_text("another heart")
+        (job.folder / "text").write_text(f"a({image.read_text()})")
+        return {}
+
+    kitchen.bodies["a"] = edited
+    image.write_text("second")
+    with pytest.raises(InputError, match=r"image: changed while the study ran.*stage a"):
+        kitchen.run()
+    assert kitchen.text("a") == "a(first)"
+    del kitchen.bodies["a"]
+    image.write_text("second")
+    kitchen.run()
+    assert kitchen.text("c") == "c(a(second),b(a(second)))"

@@ -174,6 +174,10 @@ def test_an_orientation_is_told_in_words():
     assert "90 degrees" in said
     assert "mirrored" in said
     assert "base and apex" in said
+    assert "mirror image" not in said
+    # Of an odd number of mirrorings no turn and shift is the same.
+    assert "a mirror image" in str(Orientation(90, True, False))
+    assert "a mirror image" in str(Orientation(0, False, True))
 
 
 def smooth_cine():

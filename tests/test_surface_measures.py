@@ -173,3 +173,10 @@ def test_end_of_systole_is_found_wherever_the_phases_begin(begins: float) -> Non
     noisy_ml = volume_ml + np.random.default_rng(3).normal(0, 1.5, 25)
     apart = (end_systole(phases, noisy_ml) - (0.42 - begins) + 0.5) % 1 - 0.5
     assert abs(apart) < 0.03
+
+
+def test_the_middle_of_a_plateau_ends_systole_not_the_very_smallest_volume() -> None:
+    phases = np.arange(20) / 20
+    volume_ml = np.where((phases >= 0.3) & (phases <= 0.5), 50.0, 120.0)
+    volume_ml[6] -= 1
+    assert end_systole(phases, volume_ml) == pytest.approx(0.4)

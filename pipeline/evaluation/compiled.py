@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from numba import njit
-
-from pipeline.compiled import kept_with
+from pipeline.compiled import door
 from pipeline.field.kernels import ASKED, INNER
 
 _SOURCES = (
@@ -16,13 +13,8 @@ _SOURCES = (
 )
 
 
-def asked(function: Any) -> Any:
-    """Compile what Python calls."""
-    with kept_with(Path(__file__).parent, _SOURCES):
-        return njit(**ASKED)(function)
+asked = door(Path(__file__).parent, _SOURCES, **ASKED)
+"""Compiles what Python calls."""
 
-
-def inner(function: Any) -> Any:
-    """Compile what only compiled code calls."""
-    with kept_with(Path(__file__).parent, _SOURCES):
-        return njit(**INNER)(function)
+inner = door(Path(__file__).parent, _SOURCES, **INNER)
+"""Compiles what only compiled code calls."""

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-from pipeline.compiled import kept_with
+from pipeline.compiled import door
 from pipeline.field import potential as formulas
 
 # The compiled code calls the very functions that NumPy users call.
@@ -42,16 +42,11 @@ INNER = {**ASKED, "no_cpython_wrapper": True}
 _SOURCES = ("potential", "kernels", "batches", "tool_kernels")
 
 
-def asked(function: Any) -> Any:
-    """Compile what Python calls."""
-    with kept_with(Path(__file__).parent, _SOURCES):
-        return njit(**ASKED)(function)
+asked = door(Path(__file__).parent, _SOURCES, **ASKED)
+"""Compiles what Python calls."""
 
-
-def inner(function: Any) -> Any:
-    """Compile what only compiled code calls."""
-    with kept_with(Path(__file__).parent, _SOURCES):
-        return njit(**INNER)(function)
+inner = door(Path(__file__).parent, _SOURCES, **INNER)
+"""Compiles what only compiled code calls."""
 
 
 _FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)

@@ -181,6 +181,36 @@ class FieldMetadata(Part):
         return [part.path for part in parts] + fixtures + [part.spline for part in parts]
 
 
+def attributes(metadata: FieldMetadata) -> dict[str, Any]:
+    """Attributes of the group: OME-NGFF 0.5 multiscales, one for each array, and our own."""
+    return {
+        "ome": {
+            "version": "0.5",
+            "multiscales": [_multiscale(name, metadata) for name in metadata.arrays],
+        },
+        "beatfield": metadata.model_dump(mode="json"),
+    }
+
+
+def _multiscale(name: str, metadata: FieldMetadata) -> dict[str, Any]:
+    grid = metadata.grid
+    time: dict[str, Any] = {"name": "t", "type": "time"}
+    if metadata.rr_s is not None:
+        time["unit"] = "second"
+    beat = 1.0 if metadata.rr_s is None else metadata.rr_s
+    step = beat / len(metadata.phases)
+    space = [{"name": axis, "type": "space", "unit": "millimeter"} for axis in "zyx"]
+    placed = [
+        {"type": "scale", "scale": [step, *grid.spacing_mm[::-1]]},
+        {"type": "translation", "translation": [beat * metadata.phases[0], *grid.origin_mm[::-1]]},
+    ]
+    return {
+        "name": name,
+        "axes": [time, *space],
+        "datasets": [{"path": name, "coordinateTransformations": placed}],
+    }
+
+
 LEAST_PHASE_STEP = 1e-3
 """Of a cycle; phases nearer than that are a unit mistaken."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.field.files import chunk_path
 from pipeline.field.manifest import write_manifest
-from pipeline.field.metadata import FieldMetadata
+from pipeline.field.metadata import FieldMetadata, attributes
 from pipeline.field.spline import time_solver
 from pipeline.field.verify import Report, verify_field
 from pipeline.geometry import Float32
@@ -87,33 +87,3 @@ class FieldWriter:
         """Write the final attributes, then the manifest."""
         self._group.update_attributes(attributes(metadata))
         write_manifest(self._path)
-
-
-def attributes(metadata: FieldMetadata) -> dict[str, Any]:
-    """Attributes of the group: OME-NGFF 0.5 multiscales, one for each array, and our own."""
-    return {
-        "ome": {
-            "version": "0.5",
-            "multiscales": [_multiscale(name, metadata) for name in metadata.arrays],
-        },
-        "beatfield": metadata.model_dump(mode="json"),
-    }
-
-
-def _multiscale(name: str, metadata: FieldMetadata) -> dict[str, Any]:
-    grid = metadata.grid
-    time: dict[str, Any] = {"name": "t", "type": "time"}
-    if metadata.rr_s is not None:
-        time["unit"] = "second"
-    beat = 1.0 if metadata.rr_s is None else metadata.rr_s
-    step = beat / len(metadata.phases)
-    space = [{"name": axis, "type": "space", "unit": "millimeter"} for axis in "zyx"]
-    placed = [
-        {"type": "scale", "scale": [step, *grid.spacing_mm[::-1]]},
-        {"type": "translation", "translation": [beat * metadata.phases[0], *grid.origin_mm[::-1]]},
-    ]
-    return {
-        "name": name,
-        "axes": [time, *space],
-        "datasets": [{"path": name, "coordinateTransformations": placed}],
-    }

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.field.files import map_phase, read_metadata
+from pipeline.field.files import ATTRIBUTES, map_phase, read_metadata
 from pipeline.field.manifest import MANIFEST, canonical_manifest, entry
-from pipeline.field.metadata import FieldMetadata, FixturePart, StructurePart
+from pipeline.field.metadata import FieldMetadata, FixturePart, StructurePart, attributes
 from pipeline.field.potential import offence, potential
 from pipeline.field.query import stiffness_words
 from pipeline.field.spline import node_values, phase_weights, timeline
@@ -22,6 +22,13 @@ from pipeline.geometry import Float, Grid
 # Stored potentials are rounded to float32: half a step below 1 is 2^-25. Another machine's
 # exponential may differ in its last bit, which can move the rounding by one step, 2^-24.
 POTENTIAL_TOLERANCE = 2.0**-23
+
+STEEPEST = 1 + 1e-3
+"""From node to node no distance changes by more than the way between them, but for rounding."""
+
+VOLUME_SPACINGS, VOLUME_NODES = 0.3, 4
+"""By how much nodes may enclose more than the surface does: its area times this many spacings (a
+sheet thinner than they are takes up to 1/4), and so many nodes."""
 
 ARRAY_MUST_HAVE: Mapping[str, Any] = {
     "zarr_format": 3,
@@ -83,6 +90,7 @@ def verify_field(path: Path, progress: Callable[[int, int], None] | None = None)
     _refuse(path, list(_file_problems(path, files, progress)))
     metadata = read_metadata(path)
     _refuse(path, [problem for name in metadata.arrays for problem in _array(path, name, metadata)])
+    _refuse(path, list(_place_problems(path, metadata)))
     _refuse(path, list(_value_problems(path, metadata)))
     return Report(
         files=len(files),
@@ -192,6 +200,16 @@ def _array(path: Path, name: str, metadata: FieldMetadata) -> Iterator[str]:
             yield f"{name}/zarr.json: {key} is {described.get(key)!r}, needed {value!r}"
 
 
+def _place_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
+    """Where the description for other programs puts the arrays elsewhere than our own does."""
+    told = json.loads((path / ATTRIBUTES).read_bytes())["attributes"].get("ome")
+    if told != json.loads(json.dumps(attributes(metadata)["ome"])):
+        yield (
+            f"{ATTRIBUTES}: its parts ome and beatfield disagree on names, grid, phases or rr_s, "
+            "so programs that read one or the other put the field in two places"
+        )
+
+
 def _value_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
     grid = Grid(metadata.grid.shape_zyx, metadata.grid.origin_mm, metadata.grid.spacing_mm)
     for index in range(len(metadata.phases)):
@@ -201,11 +219,38 @@ def _value_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
                 yield f"{structure.path}: phase {index} holds values that are not finite"
                 continue
             distance_mm = values.astype(np.float64)
+            yield from _distance_problems(distance_mm, structure, index, grid)
             yield from _spline_problems(path, metadata, structure, index, distance_mm)
             for fixture in metadata.fixtures.values():
                 if fixture.structure == name:
                     stored = map_phase(path / fixture.path, index, grid)
                     yield from _potential_problems(stored, distance_mm, fixture, index)
+
+
+def _distance_problems(
+    distance_mm: Float, part: StructurePart, index: int, grid: Grid
+) -> Iterator[str]:
+    """What no distance to a surface of the stated volume does, wherever the surface lies."""
+    spacing_mm = np.array(grid.spacing_mm)
+    for axis, step_mm in enumerate(spacing_mm[::-1]):
+        change_mm = np.abs(np.diff(distance_mm, axis=axis)).max(initial=0.0)
+        if change_mm > STEEPEST * step_mm:
+            yield (
+                f"{part.path}: phase {index} changes by {change_mm:.3g} mm between nodes that lie "
+                f"{step_mm:.3g} mm apart, a distance by no more than that"
+            )
+            return
+    step_mm, node_ml = float(spacing_mm.mean()), float(spacing_mm.prod()) / 1000
+    found_ml = float(np.clip(0.5 - distance_mm / step_mm, 0, 1).sum()) * node_ml
+    # Nodes nearer than a spacing fill a layer two spacings thick.
+    layer_ml = float((np.abs(distance_mm) < step_mm).sum()) * node_ml / 2
+    told_ml = part.volume_ml[index]
+    # Bodies that overlap count twice in the stated volume: less is no sign of damage.
+    if found_ml > told_ml + VOLUME_SPACINGS * layer_ml + VOLUME_NODES * node_ml:
+        yield (
+            f"{part.path}: phase {index} is negative over {found_ml:.4g} ml, its surface encloses "
+            f"{told_ml:.4g} ml: spacing, order of phases or sign is not that of the surface"
+        )
 
 
 def _spline_problems(

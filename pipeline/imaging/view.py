@@ -85,6 +85,9 @@ class Orientation:
             "mirrored in the plane" if self.mirrored else "",
             "base and apex exchanged" if self.upside_down else "",
         ]
+        # Two mirrorings are a turn, which a tracker's pose undoes; one is undone by none.
+        image = self.mirrored != self.upside_down
+        parts.append("a mirror image, to which no tracker's pose fits" if image else "")
         return "other than the file says: " + ", ".join(part for part in parts if part)
 
 

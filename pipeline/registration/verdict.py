@@ -14,7 +14,7 @@ Grade = Literal["good", "doubtful", "failed"]
 
 
 # Share of its frames up to which a sweep is against a pose, and from which it is for it.
-_AGAINST, _FOR = 0.1, 0.5
+_AGAINST, _FOR = 0.25, 0.5
 
 # Share of the best score that another pose may reach before the answer is in doubt, or open.
 _DOUBTFUL_RIVAL, _EQUAL_RIVAL = 0.75, 0.9
@@ -46,7 +46,7 @@ class Evidence:
     """From the start; 0 without one."""
 
     outvoted: tuple[int, ...] = ()
-    """Sweeps, counted from 1, hardly any frame of which bears out what another sweep does."""
+    """Sweeps, counted from 1, few frames of which bear out what another sweep does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +147,9 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
     if evidence.outvoted:
         named = ", ".join(map(str, evidence.outvoted))
         reasons.append(
-            f"hardly any frame of sweep {named} bears out what the others do, so one of them lies "
-            "beside its place, by more than is expected here: look at calibration, pixel size and "
-            "whether the patient or the tracker was moved between them"
+            f"few frames of sweep {named} bear out what the others do: where it shows the heart, "
+            "one of them lies beside its place, by more than is expected here: look at "
+            "calibration, pixel size and whether the patient or the tracker was moved between them"
         )
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")

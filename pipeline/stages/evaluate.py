@@ -39,6 +39,9 @@ REFERENCE = 0
 # Points per surface and phase; the mean distance of 4000 stratified samples repeats to 0.02 mm.
 SAMPLES = 4000
 
+SAME_PLACE_MM = 0.5
+"""By which headers of one stack may differ: less than a pixel."""
+
 
 def run(job: Job) -> dict[str, Any]:
     """Write ``metrics.json``."""
@@ -126,12 +129,21 @@ def _motion(moving: MovingSurface, known: list[Surface]) -> dict[str, Any]:
 
 def _labels(job: Job, truth: Path) -> tuple[Label, Label]:
     """Labels found and true on the cine's own pixels, ``(phase, z, y, x)``."""
-    found, _ = read_labels(job.products / "segment", "labels")
-    known, _ = read_labels(truth, "labels")
+    found, mr_from_found = read_labels(job.products / "segment", "labels")
+    known, mr_from_known = read_labels(truth, "labels")
     if found.shape != known.shape:
         raise InputError(
             f"{truth}: its labels are {known.shape} (phase, slice, row, column), those found are "
             f"{found.shape}; truth and cine must be of one study"
+        )
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(found.shape[:0:-1]) - 1)
+    moved = (mr_from_found - mr_from_known)[:3]
+    off_mm = np.linalg.norm(corners @ moved[:, :3].T + moved[:, 3], axis=1).max()
+    if off_mm > SAME_PLACE_MM:
+        raise InputError(
+            f"{truth}: its labels lie up to {off_mm:.1f} mm beside those found, at most "
+            f"{SAME_PLACE_MM:g} mm is rounding; truth and cine must be of one study, its pixels "
+            "stored in one order: give the truth of this cine, or take truth/ out"
         )
     return found, known
 

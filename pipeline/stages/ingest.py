@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Stack
 from pipeline.imaging.dicom import read_dicom_study
-from pipeline.imaging.ecg import Ecg, other_patient, read_ecg
+from pipeline.imaging.ecg import Ecg, other_patient, patient_mark, read_ecg
 from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
@@ -68,7 +68,7 @@ def run(job: Job) -> dict[str, Any]:
             *_doubts_of_beat(job, stack, ecg),
             *_doubts_of_patient(job, stack, ecg),
         ],
-        "patient": stack.patient,
+        "patient_mark": patient_mark(stack.patient),
         "long_axis": [view.name for view in views],
     }
 
@@ -104,7 +104,7 @@ def _doubts_of_beat(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
 def _doubts_of_patient(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
     if ecg is None or job.study.ecg.mr is None:
         return []
-    return other_patient(ecg, stack.patient, job.study.ecg.mr)
+    return other_patient(ecg, patient_mark(stack.patient), job.study.ecg.mr)
 
 
 def _require_ecg_as_long(job: Job, stack: Stack, ecg: Ecg | None) -> None:

@@ -126,7 +126,7 @@ def _ecg(study: Study) -> Ecg:
 
 def _doubts_of_patient(job: Job, ecg: Ecg) -> list[str]:
     assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
-    return other_patient(ecg, job.figures("ingest")["patient"], job.study.ecg.us)
+    return other_patient(ecg, job.figures("ingest")["patient_mark"], job.study.ecg.us)
 
 
 def _r_times_s(study: Study, ecg: Ecg) -> Float:

@@ -591,12 +591,20 @@ static void bf__structures(bf__json *j, bf_field *field)
     }
 }
 
+/* The steepest slope of a fixture's force over distance, N/m. */
+static double bf__stiffness(double f_max_n, double delta_mm, double m)
+{
+    /* f' is largest where (q^2 / (2 delta^2))^m is 1 - 1 / (2 m). */
+    double u = 1 - 0.5 / m;
+    return 1000 * f_max_n / delta_mm * sqrt(2.0) * m * pow(u, u) * exp(-u);
+}
+
 /* A fixture names its structure; the names are matched when all is read. */
 static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structure, size_t *size)
 {
     const char *key, *text;
     size_t length, span;
-    double m = 0;
+    double m = 0, stiffest = 0;
     int first = 1, inner, limited = 0, forbidden = -1;
     while (bf__key(j, &first, &key, &length)) {
         if (bf__is(key, length, "kind")) {
@@ -608,7 +616,10 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
                 if (bf__is(key, length, "force_n")) {
                     part->device_force_n = bf__number(j);
                     limited = 1;
-                } else bf__skip(j, 0);
+                } else if (bf__is(key, length, "stiffness_n_per_m") && !bf__null(j)) {
+                    stiffest = bf__number(j);
+                    if (!(stiffest > 0)) j->bad = 1;
+                } else if (!bf__is(key, length, "stiffness_n_per_m")) bf__skip(j, 0);
             }
         } else if (bf__is(key, length, "structure")) bf__string(j, structure, size);
         else if (bf__is(key, length, "delta_mm")) part->delta_mm = bf__number(j);
@@ -622,7 +633,9 @@ static void bf__fixture(bf__json *j, bf_fixture_part *part, const char **structu
     }
     if (!(m >= 1 && m <= 20) || m != floor(m) || !(part->delta_mm > 0 && part->delta_mm < 1e9) ||
         !(part->f_max_n > 0 && part->f_max_n < 1e9) || forbidden != (part->side != 0) ||
-        (limited && !(part->f_max_n <= part->device_force_n * (1 + 1e-9))))
+        (limited && !(part->f_max_n <= part->device_force_n * (1 + 1e-9))) ||
+        (stiffest > 0 &&
+         !(bf__stiffness(part->f_max_n, part->delta_mm, m) <= stiffest * (1 + 1e-9))))
         j->bad = 1;
     else part->m = (int)m;
 }
