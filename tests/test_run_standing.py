@@ -145,3 +145,23 @@ def test_nothing_is_made_of_files_that_change_while_the_study_runs(kitchen: Kitc
     image.write_text("second")
     kitchen.run()
     assert kitchen.text("c") == "c(a(second),b(a(second)))"
+
+
+@pytest.mark.parametrize("left", ["the folder", "nothing"])
+def test_files_that_vanish_while_the_study_runs_are_told(kitchen: Kitchen, left: str) -> None:
+    cine = kitchen.folder / "cine"
+    named = cine if left == "the folder" else kitchen.folder / "heart.nii"
+    if named != cine:
+        (cine / "image").rename(named)
+        cine.rmdir()
+        (kitchen.folder / "study.yaml").write_text("patient_id: p1\ncine: {path: heart.nii}\n")
+
+    def emptied(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text("made of what is gone")
+        (cine / "image" if named == cine else named).unlink()
+        return {}
+
+    kitchen.bodies["a"] = emptied
+    with pytest.raises(InputError, match=r"(image|heart\.nii): changed while the study ran"):
+        kitchen.run()
+    assert not (kitchen.out / "p1" / "a").exists()
