@@ -178,6 +178,9 @@ def test_a_tool_along_a_face_of_the_grid_is_inside(field):
     assert outside_share(field.grid, along_x, pose) == 1
     still = Polyline(shape="polyline", points_mm=((0, 0, 0), (0, 0, 0)), closed=True)
     assert outside_share(field.grid, still, pose) == 1
+    # Lengths that overflow tell nothing: a loop that asks for any share outside withholds.
+    endless = Polyline(shape="polyline", points_mm=((1e300, 0, 0), (0, 0, 0)))
+    assert outside_share(field.grid, endless, np.eye(4).tolist()) == 1
     with pytest.raises(InputError, match="mr_from_tool"):
         outside_share(field.grid, still, 2 * np.eye(4))
 

@@ -138,7 +138,7 @@ Tool = Annotated[Needle | Cylinder | Torus | Polyline | Mesh, Field(discriminato
 
 
 def outside_share(grid: Grid, tool: Tool, mr_from_tool: Float) -> float:
-    """Share of a tool's length that lies outside the grid, 0 to 1.
+    """Share of a tool's length that lies outside the grid, 0 to 1; 1 where there is no telling.
 
     There ``ForceField.tool_force`` is answered by the grid's boundary: the more, the less it tells.
 
@@ -156,20 +156,24 @@ def outside_share(grid: Grid, tool: Tool, mr_from_tool: Float) -> float:
     InputError
         When the pose is not rigid.
     """
-    require_rigid(np.asarray(mr_from_tool), "mr_from_tool")
-    points, starts = transform_points(mr_from_tool, tool.lines.points_mm), tool.lines.starts
+    pose = np.asarray(mr_from_tool, dtype=np.float64)
+    require_rigid(pose, "mr_from_tool")
+    points, starts = transform_points(pose, tool.lines.points_mm), tool.lines.starts
     # Pieces go from each point but a line's last to the next; an only point is a piece, too.
     alone = starts[:-1][np.diff(starts) == 1]
     start = np.union1d(np.setdiff1d(np.arange(len(points)), starts[1:] - 1), alone)
     end = start + ~np.isin(start, alone)
     from_mm, way_mm = points[start], points[end] - points[start]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         faces = (np.stack([grid.origin_mm, grid.upper_mm])[:, None] - from_mm) / way_mm
+        length_mm = np.linalg.norm(way_mm, axis=1)
+    if not np.isfinite(length_mm).all():
+        return 1.0
     # Along an axis on which a piece does not move it is between the faces all the way, or never.
     between = (from_mm >= grid.origin_mm) & (from_mm <= grid.upper_mm)
     enters = np.where(way_mm == 0, 0, faces.min(axis=0)).max(axis=1).clip(min=0)
     leaves = np.where(way_mm == 0, between, faces.max(axis=0)).min(axis=1).clip(max=1)
-    length_mm, line = np.linalg.norm(way_mm, axis=1), np.searchsorted(starts, start, "right")
+    line = np.searchsorted(starts, start, "right")
     points_only = np.bincount(line, length_mm)[line] == 0
     weight = np.where(points_only, 1 / np.bincount(line)[line], length_mm)
     inside = np.where(points_only, between.all(axis=1), (leaves - enters).clip(min=0))
