@@ -161,6 +161,21 @@ def test_missing_samples_are_a_lost_lead():
     assert score(ecg, broken)[:2] == (0, 0)
 
 
+@pytest.mark.parametrize("noise", [{}, {"muscle_snr_db": 6.0, "magnetohydrodynamic_mv": 0.5}])
+def test_ventricular_beats_look_strange_and_others_hardly_ever(noise):
+    told: dict[str, list[bool]] = {"normal": [], "premature_ventricular": []}
+    for seed in range(3):
+        ecg = record(seed=seed, duration_s=60.0, ectopic_probability=0.1, **noise)
+        beats = find_beats(ecg.signal_mv, 250.0)
+        for r_s, kind in zip(ecg.r_times_s, ecg.kinds, strict=True):
+            nearest = min(beats, key=lambda beat: abs(beat.time_s - r_s))
+            if abs(nearest.time_s - r_s) < 0.15:
+                told[kind].append(nearest.strange)
+    # One that begins as usual beats do may pass for one; a usual one misjudged costs trust for two.
+    assert np.mean(told["premature_ventricular"]) > 0.5
+    assert np.mean(told["normal"]) < 0.01
+
+
 def test_blocks_of_any_size_give_the_same_beats():
     ecg = record(duration_s=15.0, muscle_mv=0.05)
     whole = RPeakDetector(250.0, 3).push(ecg.signal_mv)

@@ -8,7 +8,9 @@ latest ``LATENCY_S`` after it; ``find_beats`` runs the same over a recording. Th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import statistics
+from collections import deque
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +29,12 @@ LATENCY_S = 0.15
 known later: those while levels are learnt, and overdue ones whose energy was low (``late``)."""
 LEARN_S = 2.0
 """Levels are learnt for so long, and on to 6 s while no beat stands out."""
+KEPT_LIKENESSES, LEAST_LIKENESSES = 16, 6
+"""A beat's likeness is compared with those of so many beats before it, and with no fewer."""
+LEAST_MARGIN, SCATTERS = 0.06, 3.0
+"""Less alike than the median by both this and so many standard deviations is another shape."""
+# Of a normal distribution, by its median absolute deviation.
+_DEVIATION = 1.4826
 # The wavelet's standard deviation: its band is 6 to 33 Hz at half height, 19 Hz in the middle.
 _WAVELET_S = 0.016
 _HALF_S, _MEAN_S, _CONFIRM_S = 0.050, 0.025, 0.055
@@ -58,13 +66,11 @@ class Beat:
     late: bool
     """Found only when it was overdue, or while the first beats were learnt."""
 
+    strange: bool
+    """Whether it looks unlike the usual beat, as those from the ventricle do."""
+
     instead: bool = False
     """Told in the place of the beat told before it, which was this one's P wave."""
-
-    @property
-    def strange(self) -> bool:
-        """Whether it looks unlike the usual beat, as those from the ventricle do."""
-        return self.likeness < ALIKE
 
 
 class RPeakDetector:
@@ -98,6 +104,7 @@ class RPeakDetector:
         self._plan = _plan(sampling_rate_hz)
         self._state = _state(self._plan, leads)
         self._leads = leads
+        self._likenesses: deque[float] = deque(maxlen=KEPT_LIKENESSES)
 
     def push(self, samples_mv: npt.ArrayLike) -> list[Beat]:
         """Take the next sample ``(leads,)``, or several ``(n, leads)``; beats that became known.
@@ -130,13 +137,17 @@ class RPeakDetector:
         return (block[start : start + step] for start in range(0, len(block), step))
 
     def _beat(self, row: Float) -> Beat:
+        likeness = float(row[at.LIKENESS])
+        strange = _is_strange(likeness, self._likenesses)
+        self._likenesses.append(likeness)
         return Beat(
             float(row[at.TIME]),
             float(row[at.KNOWN] / self._plan.rate_hz),
             int(row[at.LEAD]),
             float(row[at.HEIGHT]),
-            float(row[at.LIKENESS]),
+            likeness,
             bool(row[at.LATE]),
+            strange,
             bool(row[at.INSTEAD]),
         )
 
@@ -169,6 +180,19 @@ def with_end_held(signal_mv: Float, sampling_rate_hz: float) -> Float:
     """The recording ``(n, leads)``, its last sample repeated for as long as a beat needs."""
     held = np.repeat(signal_mv[-1:], math.ceil(LATENCY_S * sampling_rate_hz), axis=0)
     return np.concatenate([signal_mv, held])
+
+
+def _is_strange(likeness: float, others: Collection[float]) -> bool:
+    """Whether a beat's likeness to the usual shape is less than the scatter of ``others`` explains.
+
+    A wide beat that begins as the usual one does is about as alike as a usual one in noise: what
+    tells them apart is how alike the beats before were.
+    """
+    if len(others) < LEAST_LIKENESSES:
+        return likeness < ALIKE
+    usual = statistics.median(others)
+    scatter = _DEVIATION * statistics.median(abs(other - usual) for other in others)
+    return likeness < max(ALIKE, usual - max(LEAST_MARGIN, SCATTERS * scatter))
 
 
 def _time_of(beat: Beat) -> float:
