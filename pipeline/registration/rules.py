@@ -11,8 +11,6 @@ from pipeline.registration.detector_state import (
     FOUND,
     LAST_HEIGHT,
     LAST_LIKENESS,
-    LAST_STEEP,
-    LAST_TALL,
     LEVEL,
     LIKENESS,
     STEEP,
@@ -53,9 +51,9 @@ VERY_ALIKE = 0.9
 SHORT, BLUNT, ATRIAL_THRESHOLD = 0.45, 0.7, 0.6
 """But one under the first share of the usual beat's height, and under the second of the steepness
 that such a height should have, is an atrial wave up to the third place between the levels."""
-FIRST_BEATS, TOWERING, SHARPER = 12, 1.9, 1.4
-"""Among so many first beats two of so much energy, and steeper by such a factor for their height
-than the one before, are the beats; the others were P waves of a heart that beats slower."""
+FIRST_BEATS, TOWERING = 12, 1.9
+"""Among so many first beats two of so much energy are the beats; the others were P waves of a heart
+that beats slower."""
 SPAN_S, RISE_S = 0.060, 0.012
 """Height is measured this far to either side of a wave's middle; steepness is change in so long."""
 
@@ -108,9 +106,7 @@ def resembles(at: int, height: float, share: float, plan: Plan, s: State) -> boo
 @compiled
 def towers(height: float, s: State) -> bool:
     """Whether a beat is the second that shows all others so far to have been atrial waves."""
-    dull = s.numbers[LAST_STEEP] * s.numbers[TALL_NOW]
-    sharper = s.numbers[STEEP_NOW] * s.numbers[LAST_TALL] > SHARPER * dull
-    if height < TOWERING or not sharper or s.counters[BEATS] > FIRST_BEATS:
+    if height < TOWERING or s.counters[BEATS] > FIRST_BEATS:
         return False
     s.counters[TOWERS] += 1
     return bool(s.counters[TOWERS] == 2)
