@@ -11,6 +11,7 @@ from field_shapes import beating, sphere
 
 from pipeline.errors import InputError
 from pipeline.evaluation import dissection as task
+from pipeline.evaluation import rod
 from pipeline.evaluation.dissection import Condition, Room, interval, run_all, run_trial
 from pipeline.evaluation.dissection_values import Sum
 from pipeline.evaluation.operators import operator
@@ -89,6 +90,32 @@ def test_energy_made_by_holding_the_force_falls_with_the_tick(room):
     assert coarse[Sum.SAMPLING] > 0
     # Movements differ in detail, so the ratio is 0.1 within a factor of two.
     assert 0.05 < fine[Sum.SAMPLING] / coarse[Sum.SAMPLING] < 0.2
+
+
+def test_a_rod_carries_force_and_torque_to_the_hand_by_their_work():
+    """Against differences: what the tip goes and the rod turns while the handle moves a little."""
+    rng = np.random.default_rng(5)
+    pivot, length, step = np.zeros(3), task.ROD_MM, 1e-4
+    handle = 240.0 * np.array([0.48, -0.6, 0.64])
+    force, torque = rng.standard_normal(3), 50 * rng.standard_normal(3)
+    across, carried = rod.across.py_func, rod.at_the_handle.py_func
+
+    def rod_axis(place):
+        return (pivot - place) / np.linalg.norm(pivot - place)
+
+    work = []
+    for way in np.eye(3):
+        ends = [handle + sign * step * way for sign in (-0.5, 0.5)]
+        gone = np.subtract(*[across(end, pivot, length) for end in ends[::-1]])
+        turned = np.cross(rod_axis(ends[0]), rod_axis(ends[1]))
+        work.append((force @ gone + torque @ turned) / step)
+    assert np.allclose(carried(force, torque, handle, pivot, length), work, atol=1e-6)
+
+
+def test_a_whole_tool_makes_no_more_energy_than_its_sampling(room):
+    """A ring whose torque does not turn the rod about its pivot seems to make 2.5 mJ more."""
+    sums = run_trial(room, Condition("torus", False, OMEGA), 1, 0).sums
+    assert abs(sums[Sum.SAMPLING]) < 2
 
 
 def test_no_fixture_gives_nothing_and_a_heart_at_rest_neither(room):

@@ -63,6 +63,38 @@ def test_a_fixture_at_rest_is_left_alone():
     np.testing.assert_array_equal(free, kept)
 
 
+def held(force, tank, seconds: float, encoder_mm: float):
+    """Forces (N) on a trembling hand that holds its place, 0.3 N/mm and damped, seen in steps."""
+    x, v, forces = 0.0, 0.0, []
+    for tick in range(round(seconds / STEP_S)):
+        seen = encoder_mm * round(x / encoder_mm)
+        rendered = tank.passed((seen, 0.0, 0.0), (force(seen, tick * STEP_S), 0.0, 0.0))[0]
+        forces.append(rendered)
+        wish = 0.3 * np.sin(2 * np.pi * 9 * tick * STEP_S)
+        v += 1000 * (rendered + 0.3 * (wish - x) - 0.006 * v) / MASS_KG * STEP_S
+        x += v * STEP_S
+    return np.array(forces)
+
+
+@pytest.mark.parametrize("encoder_mm", [0.001, 0.03])
+def test_an_empty_tank_lets_the_force_come_and_go_without_steps(encoder_mm):
+    """The wall gives the hand more than it gets back in every beat, so the tank runs empty."""
+    tank = EnergyTank(5.0, 20.0)
+    forces = held(wall(6.0, 1.25), tank, 10.0, encoder_mm)
+
+    assert 0 < tank.level_mj < 1
+    # A twentieth of the wall's 3 N as it goes, and 0.4 N/mm at 47 mm/s.
+    assert np.abs(np.diff(forces)).max() < 0.15 + 0.02
+
+
+@pytest.mark.parametrize("encoder_mm", [0.001, 0.03])
+@pytest.mark.parametrize("capacity_mj", [0.0, 20.0])
+def test_a_tank_that_is_empty_from_the_start_drives_nothing(encoder_mm, capacity_mj):
+    tank = EnergyTank(0.0, capacity_mj)
+    held(wall(6.0, 1.25), tank, 10.0, encoder_mm)
+    assert tank.level_mj > -0.1
+
+
 @given(st.floats(0.2, 4), st.floats(0.5, 12), st.floats(0, 10))
 def test_no_swing_gives_more_than_the_tank_held(swing_mm, rate_hz, level_mj):
     given_mj = simulate(wall(swing_mm, rate_hz), EnergyTank(level_mj, 20.0), 1.5)

@@ -59,9 +59,10 @@ VIEW_DEG = 35.0
 MOMENTS = 100
 TOOLS: dict[ToolName, Any] = {
     "point": Polyline(shape="polyline", points_mm=((0.0, 0.0, 0.0),)),
-    "needle": Needle(shape="needle", length_mm=30.0, handle_mm=(0, 0, 240)),
-    "torus": Torus(shape="torus", radius_mm=10.0, handle_mm=(0, 0, 240)),
+    "needle": Needle(shape="needle", length_mm=30.0),
+    "torus": Torus(shape="torus", radius_mm=10.0),
 }
+"""Torque is about the tip, from where the rod carries it to the hand with the force."""
 TOUCHING = {"point": 1, "needle": 7, "torus": 12}
 BOUND_N = 0.1
 

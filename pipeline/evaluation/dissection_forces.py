@@ -68,7 +68,10 @@ def energy(guide, shape, pose, phase):  # type: ignore[no-untyped-def]
 
 @inner
 def force_on(guide, shape, tip, pose, phase, room):  # type: ignore[no-untyped-def]
-    """Force of the fixture on the tool, three newtons at the tip."""
+    """Force of the fixture on the tool, three newtons at the tip, and its torque into ``room[3:]``.
+
+    The torque is about ``shape.handle_mm``, the tip; a tool that is a point has none.
+    """
     phase += guide.lag
     if not shape.whole:
         x, y, z = tip[0] + guide.shift_mm[0], tip[1] + guide.shift_mm[1], tip[2] + guide.shift_mm[2]

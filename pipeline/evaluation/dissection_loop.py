@@ -261,7 +261,7 @@ def dissect(task, guide, shape, person, handle, waves, draws, trace):  # type: i
             break
         _think(task, person, mind, draws, plan, tip, phase, time, news, aim, sums)
         _record(task, tick, mind, tip, clear_mm, force, trace)
-        held = _at_the_handle(force, hand[0], task.pivot_mm, task.rod_mm)
+        held = _at_the_handle(force, room[3:], hand[0], task.pivot_mm, task.rod_mm)
         hand[4, 0], hand[4, 1], hand[4, 2] = held
         _wish(mind, plan, waves, time + task.tick_s, hand[3])
         done = sums[Sum.FIXTURE]

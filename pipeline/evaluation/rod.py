@@ -21,11 +21,12 @@ def across(point, pivot, length):  # type: ignore[no-untyped-def]
 
 
 @inner
-def at_the_handle(force, handle, pivot, length):  # type: ignore[no-untyped-def]
-    """Force at the handle (N) that does the same work as one at the tip.
+def at_the_handle(force, torque, handle, pivot, length):  # type: ignore[no-untyped-def]
+    """Force at the handle (N) that does the same work as a force and a torque (N mm) at the tip.
 
     The tip moves by J dh for a movement dh of the handle, with J = w w' - (r / l)(1 - w w'),
-    w the rod's direction, l and r its lengths outside and inside; J is symmetric.
+    w the rod's direction, l and r its lengths outside and inside; J is symmetric. The rod turns by
+    dh x w / l meanwhile, so a torque does the work of the force w x torque / l.
     """
     x, y, z = pivot[0] - handle[0], pivot[1] - handle[1], pivot[2] - handle[2]
     outside = math.sqrt(x * x + y * y + z * z)
@@ -33,7 +34,11 @@ def at_the_handle(force, handle, pivot, length):  # type: ignore[no-untyped-def]
     lever = (length - outside) / outside
     along = force[0] * x + force[1] * y + force[2] * z
     axial = (1.0 + lever) * along
-    return axial * x - lever * force[0], axial * y - lever * force[1], axial * z - lever * force[2]
+    return (
+        axial * x - lever * force[0] + (y * torque[2] - z * torque[1]) / outside,
+        axial * y - lever * force[1] + (z * torque[0] - x * torque[2]) / outside,
+        axial * z - lever * force[2] + (x * torque[1] - y * torque[0]) / outside,
+    )
 
 
 @inner

@@ -200,10 +200,10 @@ def _slope_table(found: list[Slope]) -> Table:
 def effect_of_widths() -> Section:
     """Figure 3."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
-    widths, ratio, stable = figure.subplots(1, 3)
+    widths, ratio, narrowest = figure.subplots(1, 3)
     _widths(widths)
     _ratio(ratio)
-    _stable_range(stable)
+    _rendered_range(narrowest)
     rows = [
         (
             str(m),
@@ -226,11 +226,11 @@ def effect_of_widths() -> Section:
         "gamma is the half-width of the workspace in which next to nothing is felt: f(gamma) = "
         "0.01, so delta = gamma / (√2 (-ln 0.99)^(1/(2m))). Left: the same m, wider delta (marks "
         "at gamma). Middle: what share of delta is workspace; it grows with m. Right: the "
-        "narrowest delta that each device can render at a given largest force; a device stays "
-        "stable above and left of its lines "
+        "narrowest delta that each device can render at a given largest force, by its maker's "
+        "stiffness: what lies above and left of its lines, in a loop without delay "
         "(Touch: 3.3 N and 400 N/m; omega.7: 12 N and 5000 N/m; of the Falcon only its 8.9 N are "
         "known).",
-        [picture("Workspace, and where devices stay stable", as_svg(figure), "svg")],
+        [picture("Workspace, and what devices can render", as_svg(figure), "svg")],
         [Table(head, rows)],
     )
 
@@ -268,7 +268,7 @@ def _ratio(axis: Axes) -> None:
     axis.grid(alpha=0.3)
 
 
-def _stable_range(axis: Axes) -> None:
+def _rendered_range(axis: Axes) -> None:
     for name, shown in (("touch", "Touch"), ("omega7", "omega.7")):
         device = DEVICES[name]
         assert device.stiffness_n_per_m is not None
@@ -285,7 +285,7 @@ def _stable_range(axis: Axes) -> None:
     axis.text(DEVICES["falcon"].force_n, 0.06, " Falcon", fontsize=7, rotation=90, ha="right")
     for m, (colour, style) in zip((1, 2, 4, 8), LOOKS, strict=False):
         axis.plot([], [], style, color=colour, label=f"m = {m}")
-    axis.set(xlabel="largest force (N)", ylabel="smallest stable delta (mm)", yscale="log")
+    axis.set(xlabel="largest force (N)", ylabel="smallest delta (mm)", yscale="log")
     axis.set(title="what devices can render", ylim=(0.05, 60), xlim=(0, 12.5))
     axis.legend(fontsize=7, ncols=2, loc="upper right")
     axis.grid(alpha=0.3, which="both")

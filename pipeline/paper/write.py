@@ -69,7 +69,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         lambda subject, seed, operators, progress: laws.effect_of_widths(),
         "Figure 3",
         "effect of gamma and delta on the workspace",
-        "also where each haptic device stays stable",
+        "also what each haptic device can render by its stiffness",
     ),
     "figure-4": Experiment(
         lambda subject, seed, operators, progress: slice_through_the_beat(subject),
