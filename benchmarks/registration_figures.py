@@ -2,7 +2,7 @@
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--peer 20]
-        [--global 0] [--calibration-error MM DEG]
+        [--global 0] [--calibration-error MM DEG] [--mr-pixels 1]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
@@ -11,8 +11,9 @@ benchmarks/segmentation_figures.py leaves them: its hearts are registered to wha
 in the cine, and to the cine itself, rather than to the phantom's own meshes. ``--peer N`` runs
 SimpleITK's mutual information beside it on the first N studies, ``--global N`` registers the first
 N without any start. ``--calibration-error MM DEG`` puts the pictures of each sweep so far beside
-their place, and registers with ``calibration: per_sweep`` too (0 0: nothing is wrong). Results are
-kept line by line in OUT/results.jsonl; what is there is not done again.
+their place, and registers with ``calibration: per_sweep`` too (0 0: nothing is wrong).
+``--mr-pixels 1.05`` tells pixels of the cine as larger by 5 % than they are. Results are kept line
+by line in OUT/results.jsonl; what is there is not done again.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from registration_studies import (
     start_of,
     true_surfaces,
 )
+from scipy.stats import chi2
 
 from data_synth.simulate import load_heart
 from pipeline.errors import BeatfieldError
@@ -43,6 +46,7 @@ from pipeline.geometry import Float, MovingSurface, transform_points
 from pipeline.imaging.cine import Cine
 from pipeline.products import read_cine
 from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.size import Size, planes_of
 from pipeline.registration.space import find
 from pipeline.registration.uncertainty import motion_between
 from pipeline.registration.verdict import Evidence, judge
@@ -78,7 +82,24 @@ def orders(arguments: argparse.Namespace) -> Iterator[Order]:
 def error_mm(study: Study, pose: Float) -> Float:
     """Target registration error at the points of the heart."""
     tracker = transform_points(np.asarray(np.linalg.inv(study.mr_from_tracker)), study.targets_mm)
-    return np.asarray(np.linalg.norm(transform_points(pose, tracker) - study.targets_mm, axis=1))
+    shown_mm = transform_points(study.shown_from_mr, study.targets_mm)
+    return np.asarray(np.linalg.norm(transform_points(pose, tracker) - shown_mm, axis=1))
+
+
+def with_pixels_wrong(
+    study: Study, surfaces: dict[str, MovingSurface], cine: Cine, factor: float
+) -> tuple[Study, dict[str, MovingSurface], Cine]:
+    """The same with MR pixels that are told to be larger by a factor, and so the heart in them."""
+    linear = np.eye(3) + (factor - 1) * planes_of(cine)
+    stretch = np.eye(4)
+    stretch[:3, :3] = linear
+    stretch[:3, 3] = (np.eye(3) - linear) @ study.targets_mm.mean(axis=0)
+    shown = {
+        name: replace(one, vertices_mm=transform_points(stretch, one.vertices_mm))
+        for name, one in surfaces.items()
+    }
+    told = replace(cine, mr_from_index=stretch @ cine.mr_from_index)
+    return replace(study, shown_from_mr=stretch), shown, told
 
 
 def registered(
@@ -107,6 +128,8 @@ def registered(
         "covariance": found.covariance.tolist(),
         "confidence": found.confidence,
         "rival": found.rival,
+        "larger": found.size.larger,
+        "better_by_size": found.size.gain,
         "valid": float(found.valid.sum() / max((found.residual < 1).sum(), 1)),
         "verdict": found.verdict,
         "reason": found.reason,
@@ -179,6 +202,9 @@ def result_of(
         measured = peer(order, study, guess)
     else:
         surfaces, cine = _model(order, products)
+        if arguments.mr_pixels != 1:
+            assert cine is not None, "--mr-pixels needs --surfaces PRODUCTS, which have a cine"
+            study, surfaces, cine = with_pixels_wrong(study, surfaces, cine, arguments.mr_pixels)
         known = None if method == "global" else guess
         settings = RegisterSettings(calibration="per_sweep" if method == "per_sweep" else "fixed")
         measured = registered(study, surfaces, cine, known, settings)
@@ -265,7 +291,20 @@ def calibration(results: list[dict[str, Any]]) -> list[str]:
         rms = np.sqrt((means**2).mean())
         under = f"{(means < CAPTURED_MM).mean():.1%}"
         text.append(f"| {verdict} | {len(some)} | {under} | {expected:.2f} | {rms:.2f} |")
-    return [*text, "", *chances(results), "", *thresholds(results), "", squared_error(results)]
+    parts = (chances(results), thresholds(results), coverage(results), sizes(results))
+    for part in parts:
+        text += ["", *part]
+    return text
+
+
+def sizes(results: list[dict[str, Any]]) -> list[str]:
+    """How many results fit another size of the heart clearly better."""
+    gains = np.array([one["better_by_size"] for one in results if "better_by_size" in one])
+    if not len(gains):
+        return []
+    told = sum(Size(0.0, gain).in_doubt for gain in gains)
+    best = ", ".join(f"{gain:.1%}" for gain in np.sort(gains)[::-1][:3])
+    return [f"Size in doubt: {told} of {len(gains)}; the largest gains are {best}."]
 
 
 def chances(results: list[dict[str, Any]]) -> list[str]:
@@ -291,8 +330,9 @@ def graded(one: dict[str, Any], good_tre_mm: float | None = None) -> str:
     limit_mm = {"good_tre_mm": good_tre_mm or settings.good_tre_mm}
     sure = one["confidence"], one["rival"], one["expected_mm"]
     valid = round(one["valid"] * one["frames"])
+    size = Size(one.get("larger", 0.0), one.get("better_by_size", 0.0))
     return judge(
-        Evidence(*sure, valid, one["frames"], shift_mm=0.0, turn_deg=0.0),
+        Evidence(*sure, valid, one["frames"], shift_mm=0.0, turn_deg=0.0, size=size),
         settings.model_copy(update=limit_mm),
     ).grade
 
@@ -316,17 +356,24 @@ def thresholds(results: list[dict[str, Any]]) -> list[str]:
     return text
 
 
-def squared_error(results: list[dict[str, Any]]) -> str:
-    """Mean squared error in units of the covariance: 6 where it is right."""
-    squares = []
-    for one in results:
-        if one["verdict"] in ("good", "doubtful"):
-            error = np.array(one["error"])
-            squares.append(error @ np.linalg.solve(np.array(one["covariance"]), error))
-    return (
-        "Squared error of the six parameters in units of their covariance, mean over the "
-        f"{len(squares)} that did not fail: {np.mean(squares):.1f} (6 if it is right)."
+def coverage(results: list[dict[str, Any]]) -> list[str]:
+    """Errors of what did not fail, in units of what was expected."""
+    some = [one for one in results if one["verdict"] in ("good", "doubtful")]
+    ratios = np.array([one["mean_mm"] / one["expected_mm"] for one in some])
+    squares = np.array(
+        [
+            np.array(one["error"]) @ np.linalg.solve(np.array(one["covariance"]), one["error"])
+            for one in some
+        ]
     )
+    within = [(squares < chi2.ppf(share, 6)).mean() for share in (0.5, 0.8, 0.95, 0.99)]
+    return [
+        f"Of the {len(some)} that did not fail: mean error over expected, median "
+        f"{np.median(ratios):.2f}, 95th percentile {np.quantile(ratios, 0.95):.2f}; six-parameter "
+        "errors within the ellipsoids of 50, 80, 95 and 99 %: "
+        + ", ".join(f"{share:.0%}" for share in within)
+        + f"; squared error in units of the covariance {squares.mean():.1f} (6 if it is right)."
+    ]
 
 
 def main() -> None:
@@ -340,6 +387,7 @@ def main() -> None:
     parser.add_argument("--surfaces", default="truth")
     parser.add_argument("--peer", type=int, default=20)
     parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
+    parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")
     parser.add_argument("--global", dest="without_start", type=int, default=0)
     print(tables(work(parser.parse_args())))
 

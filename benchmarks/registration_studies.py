@@ -8,7 +8,7 @@ drowned in noise afterwards.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,9 @@ class Study:
     mr_from_tracker: Float
     targets_mm: Float
     """``(n, 3)`` vertices of the heart's surface at the R peak, LPS mm."""
+
+    shown_from_mr: Float = field(default_factory=lambda: np.eye(4))
+    """4x4: where the cine shows them; elsewhere than they are if its header is wrong."""
 
 
 def make_study(order: Order, folder: Path) -> Study:

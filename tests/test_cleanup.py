@@ -231,3 +231,39 @@ def test_probabilities_still_sum_to_one(phases):
     clean_cycle(value, PIXEL_MM)
     np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-4)
     assert value.min() >= 0
+
+
+def test_a_cavity_that_is_narrow_half_way_goes_on_towards_the_tip():
+    """Papillary muscles may nearly fill it at end-systole: what widens again is no fat."""
+    inner = (0, 6, 6, 6, 9, 5, 9, 11, 12)
+    heart = np.stack([ring(radius, 18) for radius in inner])
+    np.testing.assert_array_equal(cleaned(heart), heart)
+
+
+def test_fat_that_is_ringed_beyond_the_tip_is_no_cavity():
+    bare = np.where(RADIUS < 10, CAVITY, 0)
+    heart = np.stack([ring(5, 12), bare, *(ring(k, 18) for k in (4, 9, 11, 12))])
+    found = cleaned(heart)
+    assert not (found[:2] == CAVITY).any()
+    np.testing.assert_array_equal(found[2:], heart[2:])
+
+
+def test_a_plane_without_half_of_its_wall_is_no_tip_and_is_held_within_its_neighbours():
+    heart = np.stack([ring(6 + k, 14 + k) for k in range(6)])
+    spoilt = heart.copy()
+    spoilt[3][(X > 32) & (RADIUS < 24)] = CAVITY
+    found = cleaned(spoilt)
+    np.testing.assert_array_equal(found[:3], heart[:3])
+    assert (found[3] == CAVITY)[RADIUS < 9].all()
+    assert not (found[3] == CAVITY)[RADIUS > 18].any()
+
+
+def test_a_bubble_beside_the_ventricle_does_not_end_it():
+    """A dark disc with a bright rim, wider than the cavity, which is missed beside it."""
+    away = np.hypot(X - 48, Y - 32)
+    bubble = np.where(away < 12, CAVITY, np.where(away < 15, MUSCLE, 0))
+    wall = (RADIUS < 17) & (Y < 26)
+    both = np.where((RADIUS < 10) | (away < 12), CAVITY, np.where(wall, MUSCLE, 0))
+    heart = np.stack([*(ring(5 + k, 12 + k) for k in range(6)), both, bubble, bubble])
+    found = cleaned(heart)
+    np.testing.assert_array_equal(found[:6], heart[:6])

@@ -15,6 +15,7 @@ from pipeline.geometry import transform_points
 from pipeline.registration import space
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.size import AS_IT_IS, Size
 from pipeline.registration.uncertainty import (
     chance_below,
     curvature_at,
@@ -199,6 +200,7 @@ class TestVerdict:
             ({"rival": 0.8}, "to 80%"),
             ({"valid": 20}, "20 of 48"),
             ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
+            ({"size": Size(-0.08, 0.1)}, "agree 10% better with a heart 8% smaller than"),
         ],
     )
     def test_each_weakness_makes_it_doubtful_and_is_named(self, change, reason):
@@ -211,6 +213,7 @@ class TestVerdict:
         [
             ({"expected_mm": 9.0}, "leave the pose open"),
             ({"expected_mm": float("nan")}, "leave the pose open"),
+            ({"expected_mm": 9.0, "size": Size(0.08, 0.1)}, "better with a heart 8% larger"),
             ({"confidence": 1.1}, "no pose to trust"),
             ({"rival": 0.95}, "two poses far apart"),
             ({"valid": 3}, "only 3 of 48"),
@@ -243,7 +246,8 @@ class TestVerdict:
     def test_sweeps_of_a_registration_are_compared(self):
         borne_out = np.arange(40) < 20
         level = SimpleNamespace(samples=SimpleNamespace(frames=40, number=np.arange(40)))
-        found = SimpleNamespace(everything=level, bears_out=borne_out, confidence=2.0, rival=0.1)
+        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS}
+        found = SimpleNamespace(everything=level, bears_out=borne_out, **sure)
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)
         assert verdict.grade == "doubtful"

@@ -247,6 +247,18 @@ def test_a_heart_that_jumps_for_one_phase_is_doubted():
     assert doubt.min() > 0.6
 
 
+def test_what_is_dropped_beside_the_heart_says_nothing_of_it():
+    """A chest's wall taken for muscle on the slice of the tip, larger than what is there."""
+    cine, found = beating()
+    row, column = np.mgrid[:64, :64] - 31.5
+    found.value[:, 0, 1] = 0.9 * (np.hypot(row, column) < 6)
+    found.value[:, 0, 0] = 1 - found.value[:, 0, 1]
+    alone = slice_confidence(cine, found, drawn(found))
+    found.value[2, 0, 1, :, :6] = 0.9
+    found.value[2, 0, 0] = 1 - found.value[2, 0, 1]
+    np.testing.assert_allclose(slice_confidence(cine, found, drawn(found)), alone, atol=0.02)
+
+
 @pytest.mark.parametrize(
     ("radii", "found"),
     [

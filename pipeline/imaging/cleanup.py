@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.geometry import Float32, Integer, Label, Mask
+from pipeline.imaging.auricle import join_auricle
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
 
@@ -18,20 +19,6 @@ CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
 
-AURICLE_VOXELS = 40
-"""A smaller part of the left atrium beside its body is no auricle, but an island."""
-
-NECK_STEPS = 10
-"""Longest way, in voxels, from the body to an auricle through what is likely its neck."""
-
-NECK_PROBABILITY = 0.15
-"""Least geometric mean along that way of the probability of left atrium."""
-
-NECK_BRUSH = np.zeros((3, 5, 5), bool)
-NECK_BRUSH[1] = np.hypot(*np.mgrid[-2:3, -2:3]) < 2.5
-NECK_BRUSH[[0, 2], 1:4, 1:4] = True
-"""What is painted about the way: two pixels in its plane, one in the planes beside it."""
-
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
 
@@ -39,6 +26,12 @@ LEAP, LEAP_MM2 = 1.4, 90.0
 """A cut through the ventricle may be so much larger, and by so much, than that of the plane before
 it towards the tip: room for an aneurysm, which widens by degrees."""
 
+UPON = 0.5
+"""Share of a cavity's cut that lies upon another's where both are of one ventricle."""
+
+GOES_ON = 0.25
+"""A cavity does not end where rings beyond hold so much of what those before hold: fat beyond the
+tip holds less."""
 
 NOTCH_MM = 15.0
 """Muscle that a disc of this radius, rolled along the cavity's outline, cannot reach is drawn as
@@ -120,7 +113,7 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
         tip = ventricle_tip(probability[None], pixel_mm)
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
-    _join_auricle(part)
+    join_auricle(part)
     part_from_right_heart(part, pixel_mm)
     labels = part.argmax(axis=1).astype(np.uint8)
     enclosed = _enclosed(labels == 0)
@@ -166,42 +159,6 @@ def _largest_body(mask: Mask) -> Mask:
     return np.asarray(parts == sizes.argmax())
 
 
-def _join_auricle(part: Float32) -> None:
-    """Join parts of the left atrium that a thin neck parts, along the neck's likeliest way.
-
-    The auricle's neck is thinner than the slices are apart, so that no slice may show it, yet the
-    network gives it some probability. Other chambers are never taken from.
-    """
-    from skimage.graph import MCP_Geometric
-
-    value = LABELS["left_atrium"]
-    labels = part.argmax(axis=1)
-    parts, count = ndimage.label(labels == value, np.ones((3, 3, 3), bool))
-    sizes = np.bincount(parts.ravel())[1:]
-    if count < 2 or np.sort(sizes)[-2] < AURICLE_VOXELS:
-        return
-    body = int(sizes.argmax()) + 1
-    passable = (labels == 0) | (labels == value)
-    likely = np.clip(part[:, value], 1e-3, 1)
-    ways = MCP_Geometric(np.where(passable, 0.02 - np.log(likely), np.inf))
-    costs, _ = ways.find_costs(np.argwhere(parts == body))
-    for number in np.flatnonzero(sizes >= AURICLE_VOXELS) + 1:
-        if number == body:
-            continue
-        ends = np.argwhere(parts == number)
-        nearest = ends[costs[tuple(ends.T)].argmin()]
-        if not np.isfinite(costs[tuple(nearest)]):
-            continue
-        way = np.array(ways.traceback(nearest))
-        between = way[parts[tuple(way.T)] == 0]
-        mean = np.exp(np.log(likely[tuple(between.T)]).mean()) if len(between) else 1.0
-        if len(between) <= NECK_STEPS and mean >= NECK_PROBABILITY:
-            neck = np.zeros(labels.shape, bool)
-            neck[tuple(way.T)] = True
-            neck = ndimage.binary_dilation(neck, NECK_BRUSH) & passable
-            part[:, value][neck] = 1.0
-
-
 def _keep_bodies(part: Float32) -> None:
     """Take every structure's probability outside its largest body, in place."""
     for value in LABELS.values():
@@ -230,29 +187,65 @@ def _close_apex(part: Float32, tip: int, pixel_mm: float) -> None:
     """Take from the tip of the left ventricle what cannot be it, in place.
 
     Nothing of it lies before plane ``tip``; its cavity ends where muscle no longer surrounds it,
-    or where it would leap to a larger cut.
+    or where it would leap to a larger cut (`_end_of_cavity`).
     """
     labels = part.argmax(axis=1)
     inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
     # The widest ring: a thick wall of the right ventricle may be taken for more muscle than any.
     rings = np.array([_ringed(plane) > CLOSED_SHARE for plane in labels])
     rings[:tip] = False
-    size = (inside * rings[:, None, None] if rings.any() else labels == MUSCLE).sum(axis=(1, 2))
+    shown = inside & _largest_chain(inside, rings)[:, None, None]
+    size = (shown if rings.any() else labels == MUSCLE).sum(axis=(1, 2))
     widest = int(size.argmax())
-    has_cavity = True
+    end = _end_of_cavity(part, rings, widest, tip, pixel_mm)
     for number in range(widest, -1, -1):
-        above = min(number + 1, widest)
-        border = labels[number][ndimage.binary_dilation(inside[number]) & ~inside[number]]
-        surrounded = inside[number].any() and (border == 0).mean() < OPEN_SHARE
-        cuts_mm2 = pixel_mm**2 * inside[[number, above]].sum(axis=(1, 2))
-        leaps = _leaps(*cuts_mm2)
-        has_cavity = has_cavity and number >= tip and bool(surrounded) and not leaps
         # Nothing but muscle or background lies there: no other chamber reaches the tip.
-        if not has_cavity:
+        if number < end:
             others = [value for value in LABELS.values() if value != MUSCLE]
             part[number, others] *= ~inside[number]
         if number < tip:
             part[number, MUSCLE] *= ~whole[number]
+
+
+def _largest_chain(inside: Mask, rings: Mask) -> Mask:
+    """Which planes are the rings, each upon the one before, whose cavities hold most; ``(plane,)``.
+
+    A bubble of gas, or the void about metal, shows as a ring of its own beside the ventricle.
+    """
+    chain = np.zeros(len(rings), int)
+    for below, above in pairwise(np.flatnonzero(rings)):
+        least = min(inside[below].sum(), inside[above].sum())
+        chain[above] = chain[below] + ((inside[below] & inside[above]).sum() < UPON * least)
+    held = np.bincount(chain, weights=rings * inside.sum(axis=(1, 2)))
+    return np.asarray(rings & (chain == held.argmax()))
+
+
+def _end_of_cavity(part: Float32, rings: Mask, widest: int, tip: int, pixel_mm: float) -> int:
+    """The plane nearest the tip that holds the cavity; ``widest + 1`` where none does.
+
+    A plane in which much of the wall or of the cavity was missed, as papillary muscles that fill
+    it or the void about metal make it, is no tip while rings go on beyond it: in place, its cavity
+    is held within the ventricle of the rings on both sides.
+    """
+    labels = part.argmax(axis=1)
+    inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
+    cuts_mm2 = pixel_mm**2 * inside.sum(axis=(1, 2))
+    end, number = widest + 1, widest
+    while number >= tip:
+        last = min(end, widest)
+        border = labels[number][ndimage.binary_dilation(inside[number]) & ~inside[number]]
+        surrounded = inside[number].any() and (border == 0).mean() < OPEN_SHARE
+        if surrounded and not _leaps(cuts_mm2[number], cuts_mm2[last]):
+            end, number = number, number - 1
+            continue
+        upon = pixel_mm**2 * (inside & whole[last]).sum(axis=(1, 2)) > UPON * cuts_mm2
+        leaps = np.array([_leaps(cut_mm2, cuts_mm2[last]) for cut_mm2 in cuts_mm2])
+        beyond = np.flatnonzero((rings & upon & ~leaps)[:number])
+        if cuts_mm2[beyond].sum() <= GOES_ON * (cuts_mm2 * rings)[last:].sum():
+            break
+        part[beyond[-1] + 1 : number + 1, CAVITY] *= whole[last] | whole[beyond[-1]]
+        number = int(beyond[-1])
+    return end
 
 
 def _leaps(cut_mm2: float, above_mm2: float) -> bool:

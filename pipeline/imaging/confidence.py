@@ -11,6 +11,7 @@ from itertools import product
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cine import Cine
@@ -81,28 +82,40 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
 
 
 def _without_strays(heart: Mask) -> Mask:
-    """What is taken for heart ``(slice, row, column)``, without what lies aside beyond its ends.
+    """What is taken for heart ``(slice, row, column)``, without what lies aside from it.
 
-    Bowels and vessels beyond the tip are dropped later; they say nothing of how well the heart is
-    understood. From the largest cut outwards a slice belongs to the heart that overlaps the last
-    one that does; one in between may be spoilt.
+    Bowels and vessels beyond the tip, and a chest's wall or a liver beside it, are dropped later;
+    they say nothing of how well the heart is understood. From the largest cut outwards a slice
+    belongs to the heart that overlaps the last one that does, with those of its parts alone that
+    lie upon it; one in between may be spoilt, and is judged by all that it shows.
     """
     largest = int(heart.sum(axis=(1, 2)).argmax())
-    first, last = (_last_reached(heart, largest, step) for step in (-1, 1))
     kept = heart.copy()
+    first, last = (_last_reached(kept, largest, step) for step in (-1, 1))
     kept[:first] = False
     kept[last + 1 :] = False
     return kept
 
 
 def _last_reached(heart: Mask, start: int, step: int) -> int:
-    """The last slice on the way from ``start`` that overlaps one before it, at most one between."""
+    """The last slice on the way from ``start`` that overlaps one before it, at most one between.
+
+    In place, slices on the way lose the parts that lie aside from the one before.
+    """
     last, number = start, start + step
     while 0 <= number < len(heart) and abs(number - last) <= 2:
-        if _dice(heart[None, [number]], heart[None, [last]]) >= OVERLAP[0]:
+        own = _parts_upon(heart[number], heart[last])
+        if _dice(own[None, None], heart[None, [last]]) >= OVERLAP[0]:
+            heart[number] = own
             last = number
         number += step
     return last
+
+
+def _parts_upon(plane: Mask, before: Mask) -> Mask:
+    """The connected parts of a plane that overlap what the plane before shows."""
+    parts, _ = ndimage.label(plane, np.ones((3, 3), bool))
+    return np.asarray(plane & np.isin(parts, parts[plane & before]))
 
 
 def _certainty(found: PlaneProbability, heart: Mask) -> Float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
+from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.sweep_poses import (
     TRACKER,
     frame_of_poses,
@@ -112,7 +113,8 @@ def read_sweep(
     """Read a ``.mha`` or ``.mhd`` sequence of 2D frames with a pose and a time for each.
 
     Frames whose image or transforms carry a status other than OK, or a pose of zeros, are left out
-    and told. Transforms may stand once for the whole file instead of in each frame.
+    and told; so are those that repeat a picture or a pose that is not theirs (`without_stuck`).
+    Transforms may stand once for the whole file instead of in each frame.
 
     Parameters
     ----------
@@ -147,7 +149,7 @@ def read_sweep(
     tracker_from_probe = np.stack([probe_pose(one, frame, where) for one, where in places])
     calibrated = [image_calibration(one, probe_from_image, where) for one, where in places]
     seen = (reference_pose(one) for one, _ in places)
-    return Sweep(
+    sweep = Sweep(
         path.stem,
         np.asarray(images[valid], dtype=np.float32),
         times_s,
@@ -158,6 +160,7 @@ def read_sweep(
         tuple(pose for pose in seen if pose is not None),
         (*turned, *_left_out(len(frames) - len(valid), len(frames))),
     )
+    return without_stuck(sweep)
 
 
 def _left_out(missing: int, frames: int) -> list[str]:

@@ -22,9 +22,11 @@ from pipeline.registration.calibration import Calibration, calibrate, calibratio
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
+from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.size import Size, fitting_size, planes_of
 from pipeline.registration.tissue_map import BLOOD, cavities_of
 from pipeline.registration.uncertainty import (
     chance_below,
@@ -36,8 +38,6 @@ from pipeline.registration.uncertainty import (
 )
 from pipeline.registration.verdict import Evidence, Grade, Verdict, judge, outvoted
 
-# A frame with less of its picture in blood or at its walls has too little to compare.
-_LEAST_IN_VIEW = 0.05
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
 _STEPS = 5
@@ -45,11 +45,6 @@ _STEPS = 5
 _LACKING = 0.2
 # Of each surface, to look at the expected error.
 _POINTS = 200
-_INVERTED = "by its inverse they do: is initial_mr_from_tracker given the other way round?"
-_MISPLACED = (
-    "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
-    "ProbeToTracker, ImageToProbe), calibration, units (mm) and axes (LPS; 3D Slicer shows RAS)"
-)
 
 Progress = Callable[[int, int], None]
 
@@ -107,6 +102,10 @@ class Registration:
     reason: str
     """Why it is not better; empty for a good one."""
 
+    size: Size
+    """Of the heart that the frames fit best; where that puts it in doubt, the covariance holds what
+    it is off."""
+
     clock: ClockOffset | None
     """How far the clock of the frames is ahead of the ECG's; None where it was not asked for."""
 
@@ -129,6 +128,8 @@ class _Found:
     breath_mm: Float
     bears_out: Mask
     """Of the frames of ``everything``, as those of ``breath_mm``."""
+
+    size: Size
 
 
 def register(
@@ -203,7 +204,7 @@ def find(
         settings = settings.model_copy(update={"model_error_mm": wider_mm})
     search = prepare_search(phases, surfaces, start, settings, cine)
     tell(1, _STEPS)
-    _require_heart_in_view(search.coarse_level(sweeps), search)
+    require_heart_in_view(search.coarse_level(sweeps), search)
     best = search.best(sweeps)
     settled = settle_clock(search, best, sweeps, timing, settings.clock_offset)
     search, best = settled.search, settled.best
@@ -219,8 +220,10 @@ def find(
     tiny = np.finfo(float).tiny
     confidence, rival = best.score / max(chance, tiny), best.rival / max(best.score, tiny)
     bears_out = _bears_out(everything, pose, search.pivot)
+    judged = _judged(everything, bears_out, settings)
+    size = fitting_size(judged, pose, search.pivot, planes_of(cine))
     sure = confidence, rival, settled.clock
-    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out)
+    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out, size)
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -242,27 +245,6 @@ def require_frames(
             f"{len(sweeps)} sweeps hold {frames} frames; registration needs {settings.min_frames} "
             "or more (register.min_frames): add sweeps, or write `us: null` in study.yaml"
         )
-
-
-def _require_heart_in_view(level: Level, search: Search) -> None:
-    """Refuse frames that miss the heart wherever the tracker may stand."""
-    if search.start is None:
-        return
-    settings, frames = search.settings, level.samples.frames
-    needed, seen = max(1, min(settings.min_frames, frames)), _most_in_view(level, search)
-    if seen < needed:
-        inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
-        inverted = _most_in_view(level, inverse) >= needed
-        raise (InputError if inverted else UnregistrableError)(
-            f"of {frames} frames looked at, {seen} or fewer cross the heart at every pose within "
-            f"{settings.capture_mm:g} mm and {settings.capture_deg:g} degrees of the start; "
-            + (_INVERTED if inverted else _MISPLACED)
-        )
-
-
-def _most_in_view(level: Level, search: Search) -> int:
-    poses = search.candidates(level)
-    return max(int((level.at(pose).in_view > _LEAST_IN_VIEW).sum()) for pose in poses)
 
 
 def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> float:
@@ -295,7 +277,14 @@ def _bears_out(level: Level, pose: Float, pivot: Pivot) -> Mask:
     nearby = [level.at(pivot.move(pose, step)).explained for step in steps]
     usual = here.explained > _LEAST_OF_USUAL * np.median(here.explained)
     peak = here.explained > np.quantile(nearby, 0.75, axis=0)
-    return np.asarray((here.in_view > _LEAST_IN_VIEW) & usual & peak)
+    return np.asarray((here.in_view > LEAST_IN_VIEW) & usual & peak)
+
+
+def _judged(everything: Level, bears_out: Mask, settings: RegisterSettings) -> Level:
+    """The frames that found the pose: those that bear it out, if they suffice."""
+    enough = bears_out.sum() >= settings.min_frames
+    level = everything.only(np.flatnonzero(bears_out)) if enough else everything
+    return level.thinned(settings.max_frames)
 
 
 def _some(points_mm: Float) -> Float:
@@ -339,13 +328,11 @@ def _covariance(
 ) -> tuple[Float, tuple[Correction, ...]]:
     """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor
     and what corrections of calibrations leave open; and these corrections."""
-    judged = found.everything
-    if found.bears_out.sum() >= search.settings.min_frames:
-        judged = judged.only(np.flatnonzero(found.bears_out))
-    judged = judged.thinned(search.settings.max_frames)
+    judged = _judged(found.everything, found.bears_out, search.settings)
     curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
     spread = in_radians(sandwich(curvature, _sweep_of(judged, sizes)), search.pivot)
     floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
+    floor += in_radians(found.size.error_mm**2 * np.eye(6), search.pivot)
     if found.calibration is None:
         return np.asarray(spread + floor), ()
     opened, corrections = certainty(found.calibration, judged, found.pose, search.settings)
@@ -384,6 +371,7 @@ def _summarise(
         corrections=corrections,
         verdict=verdict.grade,
         reason=verdict.reason,
+        size=found.size,
         clock=found.clock,
     )
 
@@ -397,4 +385,6 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
     against = outvoted(_sweep_of(level, sizes), found.bears_out, settings.min_frames)
     # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
     shown = level.samples.frames
-    return judge(Evidence(*sure, expected_mm, valid, shown, shift_mm, turn_deg, against), settings)
+    travelled = shift_mm, turn_deg
+    evidence = Evidence(*sure, expected_mm, valid, shown, *travelled, against, found.size)
+    return judge(evidence, settings)

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.geometry import Integer, Mask
 from pipeline.registration.settings import RegisterSettings
+from pipeline.registration.size import AS_IT_IS, Size
 
 Grade = Literal["good", "doubtful", "failed"]
 
@@ -48,6 +49,9 @@ class Evidence:
     outvoted: tuple[int, ...] = ()
     """Sweeps, counted from 1, few frames of which bear out what another sweep does."""
 
+    size: Size = AS_IT_IS
+    """Of the heart that the frames fit best."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -86,10 +90,11 @@ def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
     it out, it ended outside the range that was searched, or its expected error is beyond use. It
     is good where its expected error is small, most frames bear it out and none of that is near.
     """
-    failures = _failures(evidence, settings)
+    failures, of_size = _failures(evidence, settings), _doubts_of_size(evidence.size)
     if failures:
-        return Verdict("failed", "; ".join(failures))
-    doubts = _doubts(evidence, settings)
+        # A wrong size widens the expected error: where that fails, it is the cause.
+        return Verdict("failed", "; ".join([*of_size, *failures]))
+    doubts = [*_doubts(evidence, settings), *of_size]
     return Verdict("doubtful" if doubts else "good", "; ".join(doubts))
 
 
@@ -154,3 +159,14 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
     return reasons
+
+
+def _doubts_of_size(size: Size) -> list[str]:
+    if not size.in_doubt:
+        return []
+    way = "larger" if size.larger > 0 else "smaller"
+    return [
+        f"frames agree {size.gain:.0%} better with a heart {abs(size.larger):.0%} {way} than the "
+        "MR's: look at the MR's pixel spacing, the ultrasound's pixel size (ImageToProbe), the "
+        "tracker's unit and whether both are of one patient"
+    ]

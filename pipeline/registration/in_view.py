@@ -1,0 +1,47 @@
+"""Whether frames cross the heart at all, wherever near its start the tracker may stand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.errors import InputError, UnregistrableError
+from pipeline.registration.search import Level, Search
+
+LEAST_IN_VIEW = 0.05
+"""A frame with less of its picture in blood or at its walls has too little to compare."""
+
+_INVERTED = "by its inverse they do: is initial_mr_from_tracker given the other way round?"
+_MISPLACED = (
+    "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
+    "ProbeToTracker, ImageToProbe), calibration, units (mm) and axes (LPS; 3D Slicer shows RAS)"
+)
+
+
+def require_heart_in_view(level: Level, search: Search) -> None:
+    """Refuse frames that miss the heart wherever the tracker may stand.
+
+    Raises
+    ------
+    InputError
+        When too few cross it at every pose near the start; `UnregistrableError` unless they do at
+        poses near its inverse.
+    """
+    if search.start is None:
+        return
+    settings, frames = search.settings, level.samples.frames
+    needed, seen = max(1, min(settings.min_frames, frames)), _most_in_view(level, search)
+    if seen < needed:
+        inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
+        inverted = _most_in_view(level, inverse) >= needed
+        raise (InputError if inverted else UnregistrableError)(
+            f"of {frames} frames looked at, {seen} or fewer cross the heart at every pose within "
+            f"{settings.capture_mm:g} mm and {settings.capture_deg:g} degrees of the start; "
+            + (_INVERTED if inverted else _MISPLACED)
+        )
+
+
+def _most_in_view(level: Level, search: Search) -> int:
+    poses = search.candidates(level)
+    return max(int((level.at(pose).in_view > LEAST_IN_VIEW).sum()) for pose in poses)
