@@ -275,6 +275,7 @@ def sha256_of(path: Path) -> str:
         ) from error
 
 
+@cache
 def library_versions() -> dict[str, str]:
     """Versions of the libraries that shape the products."""
     return {name: metadata.version(name) for name in LIBRARIES}
@@ -321,6 +322,7 @@ def _source_of(module: str) -> Path | None:
     )
 
 
+@cache
 def _pipeline_imports(path: Path) -> list[str]:
     names: list[str] = []
     waiting: list[ast.AST] = [ast.parse(path.read_text())]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.geometry import Float32
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import LABELS, most_probable
 
 AURICLE_VOXELS = 40
 """A smaller part of the left atrium beside its body is no auricle, but an island."""
@@ -32,7 +32,7 @@ def join_auricle(part: Float32) -> None:
     from skimage.graph import MCP_Geometric
 
     value = LABELS["left_atrium"]
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     parts, count = ndimage.label(labels == value, np.ones((3, 3, 3), bool))
     sizes = np.bincount(parts.ravel())[1:]
     if count < 2 or np.sort(sizes)[-2] < AURICLE_VOXELS:

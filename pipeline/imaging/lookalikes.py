@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.geometry import Float, Float32, Mask
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import LABELS, most_probable
 
 VENTRICLE = (LABELS["lv_cavity"], LABELS["lv_myocardium"])
 AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
@@ -77,7 +77,7 @@ def favour_right_ventricle(value: Float32) -> None:
 
 def ventricle_cuts(value: Float32) -> Float:
     """Pixels of the left ventricle on each plane, mean over the phases."""
-    drawn = (probability.argmax(axis=1) for probability in value)
+    drawn = (most_probable(probability) for probability in value)
     cuts = [np.isin(labels, VENTRICLE).sum(axis=(1, 2)) for labels in drawn]
     return np.asarray(np.mean(cuts, axis=0))
 
@@ -89,7 +89,7 @@ def part_from_right_heart(part: Float32, pixel_mm: float) -> None:
     vessel: of the discs that stand side by side in a plane, those on the right heart's labels.
     Right heart or background takes over there, whichever is more probable.
     """
-    labels = part.argmax(axis=1)
+    labels = most_probable(part)
     right, root = np.isin(labels, RIGHT_HEART), np.zeros(labels.shape, bool)
     taken = np.zeros(labels.shape, bool)
     for number, plane in enumerate(labels == AORTA):

@@ -21,7 +21,7 @@ from pipeline.imaging.inference import (
     label_probability,
 )
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import clear_apex, favour_right_ventricle
@@ -147,7 +147,7 @@ def _require_contrast(cine: Cine) -> None:
 def _drawn(found: PlaneProbability) -> Label:
     """Most probable labels on the slices, ``(phase, slice, row, column)``."""
     phases = range(len(found.value))
-    return np.stack([found.at_slices(k).argmax(axis=1) for k in phases]).astype(np.uint8)
+    return np.stack([most_probable(found.at_slices(k)) for k in phases])
 
 
 def _require_understood(
@@ -303,7 +303,7 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
             margins[1:] += 1
             carried = [found.view.restore(one, number, (rows, columns)) for one in margins]
             chance: Float32 = np.stack([carried[0] + 2, *carried[1:]])
-            labels[phase, z] = chance.argmax(axis=0)
+            labels[phase, z] = most_probable(chance, axis=0)
     return labels
 
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Integer, Surface
-from pipeline.surface.kernels import chebyshev
+from pipeline.surface.kernels import affine_equations, chebyshev
 from pipeline.surface.level_set import LevelSet
 from pipeline.surface.mesh import laplacian, untangled, vertex_areas, vertex_normals
 
@@ -113,7 +113,7 @@ def affine_step(level: LevelSet, vertices_mm: Float, weights: Float) -> Float:
     motions that the shape does not show, such as the spin of a ball.
     """
     centre = weights @ vertices_mm
-    size_mm = np.sqrt(weights @ np.square(vertices_mm - centre).sum(axis=1))
+    size_mm = np.sqrt((weights * np.square(vertices_mm - centre).sum(axis=1)).sum())
     basis = np.column_stack([np.ones(len(vertices_mm)), (vertices_mm - centre) / size_mm])
     theta = np.zeros(12)
     ridge = _affine_ridge()
@@ -121,9 +121,8 @@ def affine_step(level: LevelSet, vertices_mm: Float, weights: Float) -> Float:
         moved = vertices_mm + basis @ theta.reshape(4, 3)
         distance, gradient = level.sample(moved)
         distance = np.clip(distance, -8 * level.spacing_mm, 8 * level.spacing_mm)
-        rows = (basis[:, :, None] * gradient[:, None, :]).reshape(-1, 12)
-        normal = rows.T @ (weights[:, None] * rows) + ridge
-        theta -= np.linalg.solve(normal, rows.T @ (weights * distance) + ridge @ theta)
+        normal, right = affine_equations(basis, gradient, distance, weights)
+        theta -= np.linalg.solve(normal + ridge, right + ridge @ theta)
     return np.asarray(vertices_mm + basis @ theta.reshape(4, 3))
 
 
@@ -298,7 +297,8 @@ def smooth_in_time(path_mm: Float, phases: Float, width_beats: float) -> Float:
     apart = (phases[:, None] - phases[None] + 0.5) % 1.0 - 0.5
     weights = np.exp(-0.5 * np.square(apart / width_beats))
     weights /= weights.sum(axis=1, keepdims=True)
-    return np.asarray(np.tensordot(2 * weights - weights @ weights, path_mm, axes=1))
+    # Unlike a product by BLAS, the same to the last bit on any number of processors.
+    return np.asarray(np.einsum("kl,lni->kni", 2 * weights - weights @ weights, path_mm))
 
 
 def restore_volume(vertices_mm: Float, triangles: Integer, volume_mm3: float) -> Float:

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the surfaces: sampling a grid, smoothing over a mesh, judging triangles.
+"""Compiled inner loops of the surfaces: sampling a grid, fitting, smoothing, judging triangles.
 
 Serial loops with a fixed order, so the same input gives the same bytes; they release the
 interpreter lock, so structures can be worked on side by side.
@@ -72,6 +72,25 @@ def chebyshev(starts, neighbours, weights, values, centre, radius, rounds):  # t
                 step[n, axis] = onward * step[n, axis] + 2 * following / radius * rest[n, axis]
         ratio = following
     return found
+
+
+@njit(nogil=True, cache=True)
+def affine_equations(basis, gradient, distance, weights):  # type: ignore[no-untyped-def]
+    """Sums w r r^T ``(12, 12)`` and w r d ``(12,)``, a point's r being basis times gradient.
+
+    A product by BLAS wakes its threads for so little, which then cost more than the sums, and
+    rounds as many ways as a machine has processors.
+    """
+    normal, right, row = np.zeros((12, 12)), np.zeros(12), np.empty(12)
+    for n in range(len(basis)):
+        for i in range(12):
+            row[i] = basis[n, i // 3] * gradient[n, i % 3]
+        for i in range(12):
+            weighted = weights[n] * row[i]
+            right[i] += weighted * distance[n]
+            for j in range(12):
+                normal[i, j] += weighted * row[j]
+    return normal, right
 
 
 @njit(nogil=True, cache=True)
