@@ -8,12 +8,18 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 
-STUDY ?= demo/studies-$(SEED)/patient-0001
+SEED ?= 1
+DEMO := demo/studies-$(SEED)/patient-0001
+STUDY ?= $(DEMO)
 OUT ?= demo/products-$(SEED)
 STUDIES ?= demo/studies-$(SEED)
 CONFIG ?= configs/default.yaml
 WORKERS ?= 2
-SEED ?= 1
+
+# Rules read them as "$$STUDY", for names may hold spaces and all else that a shell obeys.
+export STUDY OUT STUDIES CONFIG
+# A study of one's own is there, and Make knows no names with spaces.
+DEMO_STUDY := $(if $(filter-out $(DEMO),$(STUDY)),$(READY),$(DEMO)/study.yaml)
 
 STAGES := ingest segment surface register bake evaluate report
 
@@ -32,16 +38,17 @@ $(READY): requirements.lock pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
 
-demo: $(STUDY)/study.yaml ## a synthetic patient becomes a force field, with a report at the end (SEED=1)
-	$(BIN)/beatfield run "$(STUDY)" --out "$(OUT)" --config "$(CONFIG)" | tee "$(OUT).txt"
-	@sed -n 's/^query  *beatfield //p' "$(OUT).txt" | xargs $(BIN)/beatfield
+demo: $(DEMO_STUDY) ## a synthetic patient becomes a force field, with a report at the end (SEED=1)
+	mkdir -p "$$OUT"
+	$(BIN)/beatfield run "$$STUDY" --out "$$OUT" --config "$$CONFIG" | tee "$$OUT.txt"
+	@sed -n 's/^query  *beatfield //p' "$$OUT.txt" | xargs $(BIN)/beatfield
 
-demo/studies-$(SEED)/patient-0001/study.yaml: $(READY)
+$(DEMO)/study.yaml: $(READY)
 	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite
 
 paper: $(READY) ## the paper's figures and table, re-run from the demo's field: paper/index.html
-	test -d "$(OUT)/patient-0001/bake/field.zarr" || $(MAKE) demo
-	$(BIN)/beatfield paper paper --products "$(OUT)/patient-0001" --study "$(STUDY)"
+	test -d "$$OUT/patient-0001/bake/field.zarr" || $(MAKE) demo
+	$(BIN)/beatfield paper paper --products "$$OUT/patient-0001" --study "$$STUDY"
 
 test: setup ## run all tests
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
@@ -98,11 +105,11 @@ train: setup ## make the segmentation weights anew from the phantom (seven hours
 	cp training/eleventh/heart.onnx pipeline/imaging/weights/heart.onnx
 
 $(STAGES): setup
-	$(BIN)/beatfield $@ "$(STUDY)" --out "$(OUT)" --config "$(CONFIG)"
+	$(BIN)/beatfield $@ "$$STUDY" --out "$$OUT" --config "$$CONFIG"
 
 batch: setup ## run a folder of studies: make batch STUDIES=... OUT=... WORKERS=2
-	$(BIN)/beatfield batch "$(STUDIES)" --out "$(OUT)" --workers $(WORKERS) --config "$(CONFIG)"
+	$(BIN)/beatfield batch "$$STUDIES" --out "$$OUT" --workers $(WORKERS) --config "$$CONFIG"
 
-clean: ## remove the demo, caches and the virtual environment
+clean: ## remove demo/ (products without OUT= too), paper/, training/, caches and .venv
 	rm -rf demo paper training $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

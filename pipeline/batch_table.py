@@ -143,7 +143,8 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> InputError | None:
     text = io.StringIO(newline="")
     lines = csv.DictWriter(text, [field.name for field in fields(Outcome)])
     lines.writeheader()
-    lines.writerows(asdict(outcome) for outcome in outcomes)
+    for outcome in outcomes:
+        lines.writerow({name: _as_text(value) for name, value in asdict(outcome).items()})
     try:
         write_whole(path, text.getvalue())
     except InputError as error:
@@ -151,3 +152,9 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> InputError | None:
     except OSError as error:
         return InputError(f"{path}: cannot be written ({error}); clear the way, or choose --out")
     return None
+
+
+def _as_text(value: Any) -> Any:
+    """A cell that spreadsheets show: they would run a folder's name that begins as a formula."""
+    begins = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{value}" if begins else value

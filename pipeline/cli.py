@@ -10,14 +10,16 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, Parameter
 
 from pipeline import __version__
-from pipeline.console import BatchConsole, Console, say, silence, tell, tell_notes
+from pipeline.caches import provide_place
+from pipeline.console import BatchConsole, Console, show, tell
+from pipeline.ending import guarded
 from pipeline.errors import BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
 from pipeline.summary import summary
@@ -92,14 +94,14 @@ def run(
     first, last = _stage_name(from_), _stage_name(until)
     _require_order(first, last)
     record = _run(study, out, config, first, last)
-    print(summary(record, out / record["patient_id"]))
+    show(summary(record, out / record["patient_id"]))
     return 0
 
 
 def _stage_command(name: str, help_text: str) -> None:
     def command(study: Path, /, *, out: Out, config: Config = None) -> int:
         record = _run(study, out, config, last=name)
-        print(summary(record, out / record["patient_id"]))
+        show(summary(record, out / record["patient_id"]))
         return 0
 
     command.__doc__ = help_text + ", bringing the stages before it up to date."
@@ -140,7 +142,7 @@ def bake(
         raise InputError("bake needs either a STUDY or --surfaces FOLDER")
     if study is not None:
         record = _run(study, out, config, last="bake")
-        print(summary(record, out / record["patient_id"]))
+        show(summary(record, out / record["patient_id"]))
         return 0
     assert surfaces is not None
     from pipeline.config import read_settings
@@ -148,8 +150,8 @@ def bake(
 
     settings = read_settings(config, own_surfaces=True)
     field = bake_own_surfaces(surfaces, out, settings, Console().progress)
-    print(f"field     {field}")
-    print("\n".join(what_was_baked(field)))
+    show(f"field     {field}")
+    show("\n".join(what_was_baked(field)))
     return 0
 
 
@@ -177,13 +179,13 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     read_settings(config)
 
     ended = run_batch(studies, out, workers, config, BatchConsole())
-    print(table(ended.outcomes))
+    show(table(ended.outcomes))
     for note in ended.notes:
-        print(f"note      {note}")
-    print(f"products  {out}/<patient id>")
+        show(f"note      {note}")
+    show(f"products  {out}/<patient id>")
     if ended.unwritten:
         raise ended.unwritten
-    print(f"table     {out / 'batch.csv'}")
+    show(f"table     {out / 'batch.csv'}")
     if ended.interrupted:
         return INTERRUPTED_CODE
     return 0 if all(one.status in ("done", NO_STUDY) for one in ended.outcomes) else 1
@@ -216,12 +218,12 @@ def query(
     """
     answers = _ask(field, point, phase, fixture)
     if as_json:
-        print(json.dumps(answers))
+        show(json.dumps(answers))
         return 0
     for name, answer in answers.items():
         # No force has no sign.
         force = " ".join(f"{round(value, 4) + 0.0:+.4f}" for value in answer["force_n"])
-        print(
+        show(
             f"{name}: distance {answer['distance_mm']:+.3f} mm, "
             f"potential {answer['potential']:.4f}, force {force} N{_limits(answer)}"
         )
@@ -278,14 +280,14 @@ def verify(fields: list[Path], /, *, surfaces: Path | None = None) -> int:
 def _verify(field: Path, surfaces: Path | None) -> None:
     from pipeline.field.store import verify_field
 
-    print(f"{field}: {verify_field(field)}", flush=True)
+    show(f"{field}: {verify_field(field)}")
     if surfaces is not None:
         from pipeline.field.verify import certificate_rows
         from pipeline.own_surfaces import measure_field
 
         measured = measure_field(field, surfaces, Console().progress)
         for name, text in certificate_rows(measured):
-            print(f"{name:36} {text}")
+            show(f"{name:36} {text}")
 
 
 @app.command
@@ -304,7 +306,7 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
     """
     from pipeline.field.export import export_field
 
-    print(f"exported  {export_field(field, to, out)}")
+    show(f"exported  {export_field(field, to, out)}")
     return 0
 
 
@@ -332,10 +334,10 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
         raise InputError(f"{record}: {error}") from error
     write_rhythm(out, beats, ecg.leads, ecg.start_s)
     ectopic, irregular = (sum(one.kind == k for one in beats) for k in ("ectopic", "irregular"))
-    print(f"beats     {len(beats)}, {ectopic} ectopic, {irregular} irregular")
+    show(f"beats     {len(beats)}, {ectopic} ectopic, {irregular} irregular")
     if said := doubt(beats):
-        print(f"doubtful  {said}")
-    print(f"table     {out}")
+        show(f"doubtful  {said}")
+    show(f"table     {out}")
     return 0
 
 
@@ -356,7 +358,7 @@ def paper(out: Path, /, options: Annotated[PaperOptions, Parameter(name="*")] = 
     """Repeat the paper's figures and table from a baked field: OUT/index.html and its figures."""
     from pipeline.paper.write import write_paper
 
-    print(f"page      {write_paper(out, options, Console())}")
+    show(f"page      {write_paper(out, options, Console())}")
     return 0
 
 
@@ -367,27 +369,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Who starts it with `nohup` wants it to outlive the terminal.
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
-    return _guarded(lambda: app(arguments, exit_on_error=False, print_error=True))
 
+    def command() -> Any:
+        provide_place()
+        return app(arguments, exit_on_error=False, print_error=True)
 
-def _guarded(command: Callable[[], Any]) -> int:
-    try:
-        code = command()
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell. What
-        # was to be done may not be: the exit code is that of programs which this signal ends.
-        silence(sys.stdout, sys.stderr)
-        return 128 + signal.SIGPIPE
-    except CycloptsError:
-        return 2
-    except BeatfieldError as error:
-        return tell(error)
-    except KeyboardInterrupt as interrupt:
-        say("interrupted; what is finished is kept")
-        tell_notes(interrupt)
-        return 130
-    return code if isinstance(code, int) else 0
+    return guarded(command)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -12,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+
+from pipeline.caches import is_writable, own_caches, place_of_this_run
 
 
 @contextmanager
@@ -51,16 +51,14 @@ def door(folder: Path, names: Sequence[str], **options: Any) -> Callable[[Any], 
 def _place(folder: Path) -> Path:
     """Beside the sources or, where those may not be written, among the user's caches.
 
-    Left to itself the compiler would go there too, but to one place for sources of all kinds.
+    Left to itself the compiler would go there too, but to one place for sources of all kinds. A
+    user who has no place at all compiles anew in each run.
     """
     beside = folder / "__pycache__"
-    try:
-        beside.mkdir(exist_ok=True)
-        tempfile.TemporaryFile(dir=beside).close()
-    except OSError:
-        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        return Path(caches) / "beatfield"
-    return beside
+    if is_writable(beside):
+        return beside
+    own = own_caches()
+    return own if own and is_writable(own) else place_of_this_run()
 
 
 @cache

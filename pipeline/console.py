@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import sys
 import time
 from typing import TYPE_CHECKING, TextIO
@@ -12,6 +14,10 @@ from pipeline.errors import BeatfieldError
 if TYPE_CHECKING:
     # Only the command that runs a batch needs what that loads.
     from pipeline.batch_table import Outcome
+
+
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Characters that a terminal obeys and does not show."""
 
 
 class Console:
@@ -60,7 +66,7 @@ def say(text: str) -> None:
         # Closed by who called: Python would print on standard output in its place.
         return
     try:
-        print(text, file=sys.stderr, flush=True)
+        print(plain(text), file=sys.stderr, flush=True)
     except RuntimeError:
         # A signal came while another line was printed.
         return
@@ -68,9 +74,28 @@ def say(text: str) -> None:
         silence(sys.stderr)
 
 
-def silence(*streams: TextIO) -> None:
+def show(text: str) -> None:
+    """Print a result on standard output."""
+    # A terminal of few letters gets the numbers of those that it lacks.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    print(plain(text), flush=True)
+
+
+def plain(text: str) -> str:
+    """Text that may be shown: names and DICOM texts, which others write, command no terminal.
+
+    >>> print(plain("a\x1b[2Jb"))
+    a\\x1b[2Jb
+    """
+    return _COMMANDS.sub(lambda one: ascii(one[0])[1:-1], text)
+
+
+def silence(*streams: TextIO | None) -> None:
     """Let streams lead nowhere, so that Python can end without telling of them."""
     for stream in streams:
+        if stream is None:
+            continue
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)

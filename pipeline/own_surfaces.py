@@ -394,5 +394,5 @@ def _read_timing(path: Path) -> Timing:
         return Timing.model_validate(json.loads(path.read_bytes()))
     except ValidationError as error:
         raise InputError(describe_validation(error, str(path), Timing)) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error

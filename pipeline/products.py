@@ -148,7 +148,7 @@ class FrameRow:
 
 def write_frames(path: Path, rows: Sequence[FrameRow]) -> None:
     """``frames.csv``: per US frame its time, phase, residual, and whether it counted."""
-    with path.open("w", newline="") as handle:
+    with path.open("w", newline="", encoding="utf-8", errors="surrogateescape") as handle:
         table = csv.writer(handle, lineterminator="\n")
         table.writerow(FrameRow.__slots__)
         for row in rows:
@@ -162,7 +162,7 @@ def _rounded(row: FrameRow) -> list[str]:
 
 def read_frames(path: Path) -> list[FrameRow]:
     """What ``write_frames`` wrote."""
-    with path.open(newline="") as handle:
+    with path.open(newline="", encoding="utf-8", errors="surrogateescape") as handle:
         return [
             FrameRow(
                 row["sweep"],

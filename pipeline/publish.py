@@ -47,7 +47,10 @@ LIBRARIES = (
 """Those that read what goes into a product, or make it."""
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
-REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST}
+REFUSED = {
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST),
+    *(errno.ENAMETOOLONG, errno.ELOOP),
+}
 
 PACKAGE = Path(__file__).parent
 
@@ -325,7 +328,7 @@ def _source_of(module: str) -> Path | None:
 @cache
 def _pipeline_imports(path: Path) -> list[str]:
     names: list[str] = []
-    waiting: list[ast.AST] = [ast.parse(path.read_text())]
+    waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
     while waiting:
         node = waiting.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
 from pipeline.publish import sha256_of
+from pipeline.regular_files import require_no_device
 from pipeline.study_files import files_below, names_in_header, record_files, sweep_files
 from pipeline.validation import describe_validation
 from pipeline.yaml_files import read_yaml
@@ -146,6 +147,7 @@ def open_study(folder: Path) -> Study:
     folder = folder.resolve()
     _require_name_of_description(folder)
     described = folder / "study.yaml"
+    require_no_device(described)
     given = _read_yaml(described) if described.exists() else {}
     study = _understood(folder, given, str(described if given else folder))
     _require_files(study)
@@ -339,6 +341,8 @@ def _require_files(study: Study) -> None:
     for path in missing:
         if path is not None and not path.exists():
             raise InputError(f"{study.folder}: {path} does not exist; study.yaml names it")
+        if path is not None:
+            require_no_device(path)
     if not files_below(study.cine.path):
         raise InputError(
             f"{study.cine.path}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from pipeline.errors import InputError
+from pipeline.regular_files import require_no_device
 
 WFDB_ENDINGS = (".hea", ".dat")
 LITTER = ("thumbs.db", "desktop.ini")
@@ -27,8 +28,9 @@ def files_below(path: Path) -> list[Path]:
     Raises
     ------
     InputError
-        When a folder cannot be entered.
+        When a folder cannot be entered, or holds what is neither file nor folder.
     """
+    require_no_device(path)
     if not path.is_dir():
         return [path] if _is_file(path) else []
     found: list[Path] = []
@@ -44,6 +46,7 @@ def files_below(path: Path) -> list[Path]:
     for one in found:
         if one.is_symlink() and not one.exists():
             raise InputError(f"{one}: is a link that leads nowhere; mend it, or take it out")
+        require_no_device(one)
     return sorted(one for one in found if _is_file(one))
 
 
@@ -99,17 +102,29 @@ def names_in_header(header: Path) -> list[str]:
     Raises
     ------
     InputError
-        When there is such a header, and it cannot be read.
+        When there is such a header, and it cannot be read, or names files in other folders.
     """
     if not _is_file(header):
         return []
     try:
-        lines = header.read_text(errors="replace").splitlines()
+        lines = header.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
         raise InputError(f"{header}: cannot be read ({error})") from error
     named = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]
     # The first line names the record itself; a gap between segments is called ~.
-    return [name for name in named[1:] if name != "~"]
+    names = [name for name in named[1:] if name != "~"]
+    for name in names:
+        _require_beside(header, name)
+    return names
+
+
+def _require_beside(header: Path, name: str) -> None:
+    """Refuse a header, which may come from anywhere, that has files of this machine read.
+
+    What is elsewhere by the user's own will, `study.yaml` names.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
 
 
 def sweep_files(sweep: Path) -> list[Path]:
@@ -125,6 +140,7 @@ def sweep_files(sweep: Path) -> list[Path]:
     name = named[1].decode(errors="replace") if named else "LOCAL"
     if name.upper() == "LOCAL":
         return [sweep]
+    _require_beside(sweep, name)
     if _is_file(sweep.parent / name):
         return [sweep, sweep.parent / name]
     others = (one for one in _in_folder(sweep.parent) if one.suffix.lower() not in (".mha", ".mhd"))

@@ -9,6 +9,9 @@ import yaml
 
 from pipeline.errors import InputError
 
+MOST_NODES = 100_000
+"""Keys and values in a file; aliases of aliases grow a few lines beyond all memory."""
+
 
 class _Loader(yaml.SafeLoader):
     """Refuses a key that is given twice, of which YAML would keep the last and say nothing."""
@@ -33,12 +36,50 @@ def read_yaml(path: Path) -> Any:
     Raises
     ------
     InputError
-        When it cannot be read, or a section gives a key twice.
+        When it cannot be read, a section gives a key twice, or aliases make it too large.
     """
     try:
         with path.open("rb") as stream:
-            return yaml.load(stream, _Loader)
+            return _content(_Loader(stream), path)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
-    except (yaml.YAMLError, OSError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({error})") from error
+    except RecursionError as error:
+        raise InputError(
+            f"{path}: is nested too deeply, or holds itself; write it out, in a few levels"
+        ) from error
+    # Of dates and numbers that are none, such as 2024-13-01, the library raises ValueError.
+    except (yaml.YAMLError, OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read as YAML ({error}); text that looks like a date or a number "
+            "needs quotes"
+            if isinstance(error, ValueError)
+            else f"{path}: cannot be read as YAML ({error})"
+        ) from error
+
+
+def _content(loader: _Loader, path: Path) -> Any:
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        count = _nodes(node, {})
+        if count > MOST_NODES:
+            raise InputError(
+                f"{path}: its aliases (*NAME) stand for {count:.3g} keys and values, at most "
+                f"{MOST_NODES} are read; write out what is meant"
+            )
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _nodes(node: yaml.Node, known: dict[int, int]) -> int:
+    """How many nodes a node stands for, each alias written out."""
+    if id(node) not in known:
+        inside: list[yaml.Node] = []
+        if isinstance(node, yaml.MappingNode):
+            inside = [one for pair in node.value for one in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            inside = node.value
+        known[id(node)] = 1 + sum(_nodes(one, known) for one in inside)
+    return known[id(node)]

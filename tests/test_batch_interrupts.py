@@ -125,11 +125,11 @@ def test_a_killed_batch_leaves_the_table_of_what_ended_and_its_studies_know(
 MEMBER = """
 import signal, sys
 from pipeline import batch_member
-from pipeline.cli import _guarded
+from pipeline.ending import guarded
 def main():
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     ignored = [signal.getsignal(one) is signal.SIG_IGN for one in (signal.SIGINT, signal.SIGHUP)]
-    return _guarded(lambda: (print(*ignored, flush=True), signal.pause()))
+    return guarded(lambda: (print(*ignored, flush=True), signal.pause()))
 batch_member.main = main
 sys.exit(batch_member.run())
 """

@@ -381,8 +381,8 @@ def test_a_reader_that_has_read_enough_gets_no_traceback(stream: str) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     script = (
-        "import sys; from pipeline.cli import _guarded; "
-        f"sys.exit(_guarded(lambda: print(1, file=sys.{stream}, flush=True)))"
+        "import sys; from pipeline.ending import guarded; "
+        f"sys.exit(guarded(lambda: print(1, file=sys.{stream}, flush=True)))"
     )
     other = {"stdout": "stderr", "stderr": "stdout"}[stream]
     done = subprocess.run(

@@ -182,12 +182,16 @@ def _mhd(field: _Stored, folder: Path) -> None:
             )
         for index, chunk in enumerate(chunks):
             header = _mhd_header(field, [], [], chunk)
-            (folder / f"{_name(part)}_{index:03d}.mhd").write_text(header)
+            (folder / f"{_name(part)}_{index:03d}.mhd").write_text(
+                header, encoding="utf-8", errors="surrogateescape"
+            )
         step = field.beat / len(field.times)
         header = _mhd_header(
             field, [step], [field.times[0]], "\n".join(["LIST 3", *chunks]), len(chunks)
         )
-        (folder / f"{_name(part)}.mhd").write_text(header)
+        (folder / f"{_name(part)}.mhd").write_text(
+            header, encoding="utf-8", errors="surrogateescape"
+        )
 
 
 def _mhd_header(

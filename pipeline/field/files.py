@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.metadata import FieldMetadata, FixturePart
 from pipeline.geometry import Float32, Grid
+from pipeline.regular_files import require_no_device
 
 ATTRIBUTES = "zarr.json"
 
@@ -60,6 +61,8 @@ def require_manifest(path: Path) -> bytes:
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
+    for name in (MANIFEST, ATTRIBUTES):
+        require_no_device(path / name)
     try:
         text = (path / MANIFEST).read_bytes()
         expected = json.loads(text)["files"][ATTRIBUTES]["sha256"]
@@ -70,7 +73,7 @@ def require_manifest(path: Path) -> bytes:
             f"{path}: has no {missing}, so it is no complete field; give "
             "the field.zarr that bake wrote, or bake it again"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path / MANIFEST}: cannot be read ({error!r}); bake again") from error
     if expected != actual:
         raise InputError(f"{path / ATTRIBUTES}: is not what the manifest says; bake it again")
@@ -93,7 +96,7 @@ def read_metadata(path: Path) -> FieldMetadata:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(f"{source}: beatfield.{place}: {first['msg']}") from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{source}: holds no beatfield attributes ({error!r}); give a field.zarr"
         ) from error

@@ -18,6 +18,7 @@ from pipeline.field.potential import offence, potential
 from pipeline.field.query import stiffness_words
 from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.geometry import Float, Grid
+from pipeline.regular_files import require_no_device
 
 # Stored potentials are rounded to float32: half a step below 1 is 2^-25. Another machine's
 # exponential may differ in its last bit, which can move the rounding by one step, 2^-24.
@@ -135,6 +136,7 @@ def _refuse(path: Path, problems: list[str]) -> None:
 
 def _read_manifest(source: Path) -> dict[str, dict[str, Any]]:
     """Files by name, when the manifest is byte for byte what would be written for them."""
+    require_no_device(source)
     try:
         raw = source.read_bytes()
         files: dict[str, dict[str, Any]] = json.loads(raw)["files"]

@@ -16,6 +16,7 @@ from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
+from pipeline.imaging.limits import MOST_PIXELS, require_bounded
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
 from pipeline.study_files import files_below
 
@@ -203,6 +204,10 @@ def _groups(shared: Any, own: Any) -> Groups:
 
 def _pixels(dataset: Any, path: Path) -> Any:
     """Stored values, ``(frame, row, column)``."""
+    frames = max(int(dataset.get("NumberOfFrames", 1) or 1), 1)
+    pixels = int(dataset.Rows or 0) * int(dataset.get("Columns") or 0)
+    require_bounded(pixels, f"{path}: one image", MOST_PIXELS)
+    require_bounded(frames * pixels, str(path))
     try:
         stored = dataset.pixel_array
     except Exception as error:  # pydicom's decoders raise many kinds for damaged pixel data
@@ -213,9 +218,7 @@ def _pixels(dataset: Any, path: Path) -> Any:
                 f"in a way not known here ({_syntax(dataset).name}; {error}); copy it again from "
                 "the scanner, uncompressed"
             ) from error
-    if stored.size != max(int(dataset.get("NumberOfFrames", 1) or 1), 1) * dataset.Rows * (
-        dataset.Columns
-    ):
+    if stored.size != frames * dataset.Rows * dataset.Columns:
         raise InputError(f"{path}: is in colour; the cine needs grey images")
     return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
 

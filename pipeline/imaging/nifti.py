@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import zlib
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
+from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -196,6 +198,7 @@ def _load(path: Path) -> Any:
         raise InputError(
             f"{path}: cannot be read as NIfTI ({error}); copy or convert it again"
         ) from error
+    require_bounded(math.prod(int(size) for size in image.shape), str(path))
     if image.get_data_dtype().kind == "V":
         raise InputError(f"{path}: its voxels are colours; store one grey value a voxel")
     if image.get_data_dtype().kind == "c":
@@ -291,7 +294,7 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
     )
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(content, dict) or not {"trigger_times_ms", "rr_ms"} <= set(content):
         found = ", ".join(content) if isinstance(content, dict) else repr(content)

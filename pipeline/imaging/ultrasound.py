@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
+from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.sweep_poses import (
     TRACKER,
@@ -233,6 +234,7 @@ def _require_all_bytes(path: Path) -> None:
     The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
     """
     header, start = _header_of(path)
+    require_bounded(_pixel_bytes(header) or 0, str(path))
     where = header.get(_HEADER_ENDS, "")
     if _SEVERAL_FILES.search(where):
         return

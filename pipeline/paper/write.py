@@ -168,7 +168,9 @@ def write_paper(out: Path, options: PaperOptions, watcher: Watcher) -> Path:
         parts.append(Part(name, section, f"{options.command()} --only {name}"))
     with publishing(out) as folder:
         (folder / MARK).write_text("written by beatfield paper\n")
-        (folder / "index.html").write_text(render(subject, parts, notes))
+        (folder / "index.html").write_text(
+            render(subject, parts, notes), encoding="utf-8", errors="backslashreplace"
+        )
         for part in parts:
             _write_files(folder, part)
     return out / "index.html"
@@ -227,7 +229,9 @@ def _write_files(folder: Path, part: Part) -> None:
         ending = "svg" if "svg" in head else head.split("/")[1].split(";")[0]
         (folder / f"{part.name}-{number}.{ending}").write_bytes(base64.b64decode(coded))
     for number, table in enumerate(part.section.tables, start=1):
-        with (folder / f"{part.name}-table-{number}.csv").open("w", newline="") as handle:
+        with (folder / f"{part.name}-table-{number}.csv").open(
+            "w", newline="", encoding="utf-8"
+        ) as handle:
             lines = csv.writer(handle, lineterminator="\n")
             lines.writerow(table.head)
             lines.writerows(table.rows)

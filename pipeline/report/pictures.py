@@ -91,7 +91,8 @@ def cuts_on_ultrasound(
             )
         rows, columns = image.shape
         axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-        axis.set_title(f"{called}, phase {phase:.2f}", fontsize=9)
+        # Names of files may hold what would be taken for a formula.
+        axis.set_title(f"{called}, phase {phase:.2f}", fontsize=9, parse_math=False)
     drawn = {name: style for name, style in SURFACE_STYLES.items() if name in surfaces}
     figure.legend(
         handles=[handle(name, *style) for name, style in drawn.items()],

@@ -51,7 +51,7 @@ def run(job: Job) -> dict[str, Any]:
         _example(job),
         _notes(job),
     )
-    (job.folder / "index.html").write_text(page)
+    (job.folder / "index.html").write_text(page, encoding="utf-8", errors="backslashreplace")
     return {"pictures": sum(len(section.pictures) for section in sections)}
 
 

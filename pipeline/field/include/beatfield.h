@@ -890,9 +890,12 @@ static FILE *bf__file(const bf__folder *folder, const char *name, size_t length)
     file = fopen(path, "rb");
 #else
     {
-        int number = openat(folder->number, path + before, O_RDONLY);
+        /* A pipe would let us wait for who writes into it, and a device never ends. */
+        int number = openat(folder->number, path + before, O_RDONLY | O_NONBLOCK);
+        struct stat about;
         if (number >= 0) {
-            file = fdopen(number, "rb");
+            if (!fstat(number, &about) && S_ISREG(about.st_mode)) file = fdopen(number, "rb");
+            else errno = EINVAL;
             if (!file) close(number);
         }
     }

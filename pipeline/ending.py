@@ -1,0 +1,48 @@
+"""How the program ends: every way that is no fault of its own has words and an exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from cyclopts import CycloptsError
+
+from pipeline.console import say, silence, tell, tell_notes
+from pipeline.errors import BeatfieldError
+from pipeline.publish import NO_SPACE
+
+MORE_MEMORY = "use fewer --workers, raise `ulimit -v`, or take a larger machine"
+
+
+def guarded(command: Callable[[], Any]) -> int:
+    """Do what a command does; return its exit code."""
+    try:
+        code = command()
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell. What
+        # was to be done may not be: the exit code is that of programs which this signal ends.
+        silence(sys.stdout, sys.stderr)
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        # Of a file there would be its name.
+        if error.errno not in NO_SPACE or error.filename is not None:
+            raise
+        silence(sys.stdout)
+        say(f"error: what is printed, or a temporary file, cannot be written ({error.strerror})")
+        return 2
+    except MemoryError as error:
+        say(f"error: memory is not enough ({error}); {MORE_MEMORY}")
+        return 1
+    except CycloptsError:
+        return 2
+    except BeatfieldError as error:
+        return tell(error)
+    except KeyboardInterrupt as interrupt:
+        say("interrupted; what is finished is kept")
+        tell_notes(interrupt)
+        return 130
+    return code if isinstance(code, int) else 0

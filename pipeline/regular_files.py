@@ -1,0 +1,26 @@
+"""Files that can be read to their end."""
+
+from __future__ import annotations
+
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from pipeline.errors import InputError
+
+
+def require_no_device(path: Path) -> None:
+    """Refuse what may never end, or never begin, where a file is to be read.
+
+    Raises
+    ------
+    InputError
+        When it is a pipe, a socket or a device, or a link to one.
+    """
+    with suppress(OSError):
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError(
+                f"{path}: is a pipe, a socket or a device, a file is needed; put the file itself "
+                "there, or take it out"
+            )

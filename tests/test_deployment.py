@@ -1,0 +1,152 @@
+"""The program where no developer sits: other users, closed terminals, names of any kind."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import caches, compiled
+from pipeline.batch_table import outcome_of, write_table
+from pipeline.console import plain, show
+from pipeline.ending import guarded
+from pipeline.errors import InputError
+from pipeline.publish import locked
+from pipeline.report import pictures
+
+ROOT = Path(__file__).parents[1]
+BEATFIELD = [sys.executable, "-m", "pipeline"]
+
+
+def nowhere(*_: object, **__: object) -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
+def a_package_that_may_not_be_written(root: Path) -> Path:
+    package = root / "package"
+    package.mkdir()
+    (package / "one.py").write_text("")
+    (package / "__pycache__").write_text("no folder")
+    return package
+
+
+@pytest.mark.parametrize("home", [None, "a file"])
+def test_a_user_without_a_home_compiles_in_a_folder_of_the_run(tmp_path, monkeypatch, home):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setattr(Path, "home", nowhere if home is None else lambda: tmp_path / home)
+    caches.place_of_this_run.cache_clear()
+    place = compiled._place.__wrapped__(a_package_that_may_not_be_written(tmp_path))
+    caches.place_of_this_run.cache_clear()
+    assert place.parent == tmp_path
+    # Stored code is run: nobody else may put some there.
+    assert place.stat().st_mode & 0o077 == 0
+
+
+def test_where_nothing_may_be_written_it_is_said_what_to_give(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    caches.place_of_this_run.cache_clear()
+    with pytest.raises(InputError, match=r"kept nowhere .*XDG_CACHE_HOME or TMPDIR"):
+        compiled._place.__wrapped__(a_package_that_may_not_be_written(tmp_path))
+
+
+@pytest.mark.parametrize(("ends", "code"), [(">&-", 0), ("<&- >&- 2>&-", 0), ("> /dev/full", 2)])
+def test_closed_or_full_outputs_end_without_a_traceback(ends: str, code: int) -> None:
+    command = f"'{sys.executable}' -m pipeline --version {ends}"
+    ended = subprocess.run(
+        ["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == code
+    assert "Traceback" not in ended.stderr
+
+
+def test_memory_that_is_not_enough_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    def greedy() -> int:
+        raise MemoryError("Unable to allocate 12 GiB")
+
+    assert guarded(greedy) == 1
+    assert "error: memory is not enough (Unable to allocate 12 GiB)" in capsys.readouterr().err
+
+
+def test_a_folders_name_commands_no_terminal(tmp_path: Path) -> None:
+    study = tmp_path / "s\x1b]0;mine\x07\x1b[2J\u202e"
+    (study / "cine").mkdir(parents=True)
+    command = [*BEATFIELD, "ingest", str(study), "--out", str(tmp_path / "out")]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "s\\x1b]0;mine\\x07\\x1b[2J\\u202e: its name is no" in ended.stderr
+    assert plain("two\n\tlines: 5 µm") == "two\n\tlines: 5 µm"
+
+
+def test_a_terminal_of_few_letters_is_shown_the_others_numbers(tmp_path: Path) -> None:
+    program = f"from pipeline.console import {show.__name__}; show('\xe9')"
+    plainest = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, cwd=ROOT, env=plainest, capture_output=True, check=False)
+    assert ended.stdout == b"\\xe9\n"
+
+
+def test_files_are_read_and_written_alike_whatever_letters_the_system_knows(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from pipeline import publish, products; "
+        "publish.code_digest('pipeline.stages.ingest'); "
+        "row = products.FrameRow('us-\\xe9', 0, 0.0, 0.0, 0.0, True); path = Path(sys.argv[1]); "
+        "products.write_frames(path, [row]); "
+        "assert products.read_frames(path) == [row]"
+    )
+    bare = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-c", program, str(tmp_path / "frames.csv")]
+    ended = subprocess.run(
+        command, cwd=ROOT, env={**os.environ, **bare}, capture_output=True, check=False
+    )
+    assert ended.stderr == b""
+    assert "us-é" in (tmp_path / "frames.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@SUM(A1)"])
+def test_a_spreadsheet_runs_no_folders_name(tmp_path: Path, name: str) -> None:
+    outcome = outcome_of(name, "failed", "=cause", "p-1", Path("/studies") / name).outcome
+    assert write_table(tmp_path / "batch.csv", [outcome]) is None
+    with (tmp_path / "batch.csv").open(newline="") as handle:
+        [row] = csv.DictReader(handle)
+    assert (row["patient"], row["cause"], row["patient_id"]) == (f"'{name}", "'=cause", "p-1")
+
+
+def test_an_out_whose_name_is_too_long_is_refused(tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError, match=r"cannot be written .File name too long"),
+        locked(tmp_path / ("x" * 300)),
+    ):
+        pass
+
+
+def test_a_sweeps_name_is_no_formula() -> None:
+    figure = pictures.cuts_on_ultrasound(
+        [np.zeros((4, 4))], ["a$\\frac{$, frame 3"], np.eye(4)[None], np.zeros(1), {}
+    )
+    figure.savefig(io.BytesIO())
+
+
+def made(*words: str) -> str:
+    """What `make` would do, everything being set up."""
+    command = ["make", "-n", "-o", ".venv/ready", *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+def test_make_takes_names_with_spaces_and_all_that_a_shell_obeys(tmp_path: Path) -> None:
+    study, out = tmp_path / 'with spaces; $$(touch x) "quoted"', tmp_path / "my products" / "new"
+    for target in ("demo", "ingest"):
+        said = made(target, f"STUDY={study}", f"OUT={out}")
+        assert "synth" not in said
+        assert '"$STUDY" --out "$OUT"' in said
+    assert str(study) not in made("demo", f"STUDY={study}")
+    assert 'mkdir -p "$OUT"' in made("demo", f"OUT={out}")
