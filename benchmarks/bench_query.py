@@ -24,7 +24,6 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
 from pipeline.field import ForceField, batches, get_include, kernels
-from pipeline.field.distance import node_axes
 from pipeline.field.threads import processors
 from pipeline.field.tool import Polyline, Torus
 from pipeline.geometry import Float
@@ -92,7 +91,7 @@ def peers(field: ForceField) -> dict[str, Callable[[Float, Float], object]]:
     phases = field.phases
     volume = np.stack([field.stored_distance_mm("epicardium", k) for k in range(len(phases))])
     volume = np.concatenate([volume, volume[:1]])
-    axes = [np.append(phases, phases[0] + 1), *node_axes(field.grid)[::-1]]
+    axes = [np.append(phases, phases[0] + 1), *field.grid.axes_mm[::-1]]
     linear = RegularGridInterpolator(axes, volume, bounds_error=False, fill_value=None)
     origin, spacing = np.array(field.grid.origin_mm), np.array(field.grid.spacing_mm)
 

@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from registration_studies import PATHOLOGIES, TRUTH_PHASES, found_surfaces
+from registration_studies import TRUTH_PHASES, found_surfaces
 
+from data_synth.pathology import PATHOLOGIES
 from data_synth.probe import EXAMINATIONS
 from data_synth.settings import PhantomSettings
 from data_synth.simulate import (

@@ -205,7 +205,7 @@ def bake(surfaces: list[Surface], spacing_mm: float) -> tuple[Grid, Float]:
     return grid, np.stack([distance_of_closed(one, grid) for one in surfaces])
 
 
-def nanoseconds(stored: Float, grid: Grid, way: tuple[int, int], rng: np.random.Generator) -> float:
+def nanoseconds(stored: Float, grid: Grid, way: tuple[int, int]) -> float:
     """Time of the processor for one question on a path of 0.1 mm steps."""
     count, middle = 20_000, (np.array(grid.origin_mm) + grid.upper_mm) / 2
     path = middle + 15 * np.sin(0.1 * np.arange(count)[:, None] / 15 * (0.7, 0.8, 0.9) + (0, 1, 2))
@@ -250,7 +250,7 @@ def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, see
         print(
             f"| {mark}{NAMES[way[0]]}{mark} | {mark}{NAMES[way[1]]}{mark} | "
             f"{judged(stored, grid, way, on, near)} | {jump:.4f} | {rate:.3f} | "
-            f"{nanoseconds(stored, grid, way, rng):.0f} |",
+            f"{nanoseconds(stored, grid, way):.0f} |",
             flush=True,
         )
 

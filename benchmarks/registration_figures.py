@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 from registration_peer import compounded, mr_volume, mutual_information
 from registration_studies import (
-    PATHOLOGIES,
     Order,
     Study,
     found_surfaces,
@@ -40,6 +39,7 @@ from registration_studies import (
 )
 from scipy.stats import chi2
 
+from data_synth.pathology import PATHOLOGIES
 from data_synth.simulate import load_heart
 from pipeline.errors import BeatfieldError
 from pipeline.geometry import Float, MovingSurface, transform_points

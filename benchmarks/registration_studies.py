@@ -25,14 +25,6 @@ from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.products import read_surfaces, read_table
 from pipeline.registration.correction import tracker_from_picture
 
-PATHOLOGIES = (
-    "healthy",
-    "dilated_cardiomyopathy",
-    "hypertrophic_cardiomyopathy",
-    "rv_dilation",
-    "infarct",
-    "enlarged_atrium",
-)
 SWEEPS, RECORDED = 2, 24
 """How many sweeps are recorded, and frames in each."""
 TRUTH_PHASES = np.arange(20) / 20

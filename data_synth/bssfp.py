@@ -14,8 +14,9 @@ from data_synth.tissue import Tissue
 
 Complex = npt.NDArray[np.complex128]
 
-PROTON_HZ_PER_T = 42.577478518e6
+PROTON_MHZ_PER_T = 42.577478518
 """Gyromagnetic ratio of the proton over 2 pi (CODATA 2018)."""
+PROTON_HZ_PER_T = 1e6 * PROTON_MHZ_PER_T
 FAT_SHIFT_PPM = -3.4
 """Chemical shift of fat's main resonance against water."""
 FATTY = (Tissue.FAT, Tissue.BONE)

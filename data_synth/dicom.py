@@ -7,10 +7,10 @@ from pathlib import Path
 
 from data_synth.dicom_classic import write_classic
 from data_synth.dicom_enhanced import write_enhanced
-from data_synth.dicom_header import HOLD_S, ImageSeries
+from data_synth.dicom_header import ImageSeries
 from data_synth.errors import SynthError
 from data_synth.mr import SyntheticCine
-from data_synth.protocol import MrSettings
+from data_synth.protocol import BREATH_HOLD_S, MrSettings
 
 LONGEST_PATIENT_ID = 56
 """64 characters are all that PatientName has room for, "Phantom^" among them."""
@@ -77,11 +77,11 @@ def _plan(
         first = [ImageSeries(1, "cine short axis", cine, slices, 0.0)]
     else:
         first = [
-            ImageSeries(z + 1, f"cine short axis, slice {z + 1}", cine, (z,), z * HOLD_S)
+            ImageSeries(z + 1, f"cine short axis, slice {z + 1}", cine, (z,), z * BREATH_HOLD_S)
             for z in slices
         ]
     yield from first
     number, start_s = first[-1].number, first[-1].start_s + first[-1].duration_s
     for k, (name, view) in enumerate(views.items()):
         title = f"cine long axis, {name.replace('_', ' ')}"
-        yield ImageSeries(number + 1 + k, title, view, (0,), start_s + k * HOLD_S)
+        yield ImageSeries(number + 1 + k, title, view, (0,), start_s + k * BREATH_HOLD_S)

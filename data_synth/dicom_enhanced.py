@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from data_synth.breathing import Breathing
+from data_synth.bssfp import PROTON_MHZ_PER_T
 from data_synth.dicom_header import (
     MANUFACTURER,
     ImageSeries,
@@ -36,8 +37,6 @@ from data_synth.protocol import MrSettings
 from data_synth.sampling import acquisition_window
 
 ENHANCED_MR_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.4.1"
-PROTON_MHZ_PER_T = 42.577478518
-"""Gyromagnetic ratio of the proton over 2 pi (CODATA 2018)."""
 PIXEL_BANDWIDTH_HZ = 930.0
 """The standard asks for values that the phantom has no use for: bandwidth, absorption rate and
 gradient output are those of an ordinary cine, and change nothing in the images."""

@@ -12,14 +12,10 @@ from typing import Any
 import numpy as np
 
 from data_synth.mr import Int16, SyntheticCine
-from data_synth.protocol import MrSettings
+from data_synth.protocol import BREATH_HOLD_S, VOLUME_S, MrSettings
 
 START = datetime(2020, 1, 1, 12)
 """Every study begins at this moment: the same seed must give the same bytes."""
-HOLD_S = 7.0
-"""Time from the start of one breath-hold to the next."""
-VOLUME_S = 180.0
-"""Time that a volume takes in free breathing."""
 EXPLICIT_LITTLE_ENDIAN = "1.2.840.10008.1.2.1"
 MANUFACTURER = "beatfield phantom"
 
@@ -50,12 +46,12 @@ class ImageSeries:
     def moment(self, z: int) -> datetime:
         """When the acquisition of slice ``z`` begins; a slab is acquired as one."""
         holds = 0 if self.volume else self.slices.index(z)
-        return START + timedelta(seconds=self.start_s + HOLD_S * holds)
+        return START + timedelta(seconds=self.start_s + BREATH_HOLD_S * holds)
 
     @property
     def duration_s(self) -> float:
         """How long the acquisition lasts."""
-        return VOLUME_S if self.volume else HOLD_S * len(self.slices)
+        return VOLUME_S if self.volume else BREATH_HOLD_S * len(self.slices)
 
 
 def unique_identifier(*parts: object) -> str:

@@ -7,6 +7,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 FIELD_STRENGTHS_T = (1.5, 3.0)
+BREATH_HOLD_S = 7.0
+"""Time from the start of one slice's breath-hold to that of the next."""
+VOLUME_S = 180.0
+"""Time that the isotropic volume takes; the navigator accepts a third of the beats or so."""
 
 
 class MrSettings(BaseModel):

@@ -23,15 +23,12 @@ from data_synth.mr import (
     count_slices,
 )
 from data_synth.population import draw_heart
+from data_synth.protocol import BREATH_HOLD_S, VOLUME_S
 from data_synth.settings import PhantomSettings, check_settings
 from data_synth.ultrasound import Sweep, simulate_sweeps
 
 Progress = Callable[[int, int], None]
 
-BREATH_HOLD_S = 7.0
-"""Time from one slice's acquisition to the next."""
-VOLUME_S = 180.0
-"""Time that the isotropic volume takes; the navigator accepts a third of the beats or so."""
 SWEEP_PAUSE_S = 3.0
 """Time between two ultrasound sweeps that the recorded ECG has to leave room for."""
 START_MM, START_DEG = 10.0, 10.0

@@ -24,13 +24,18 @@ from pipeline.batch_plan import (
     notes_on,
     plan_batch,
     products_of,
-    read_record,
-    record_bytes,
 )
 from pipeline.batch_table import INTERRUPTED, NO_STUDY, Ended, Outcome, outcome_of, rows
 from pipeline.batch_table import write_table as write_csv
 from pipeline.errors import NOT_TO_BE_USED, InputError
-from pipeline.publish import PARTIAL, locked, readable_write_errors, remove
+from pipeline.publish import (
+    PARTIAL,
+    locked,
+    read_record,
+    readable_write_errors,
+    record_bytes,
+    remove,
+)
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.5

@@ -6,12 +6,10 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.batch_plan import read_record, record_bytes
 from pipeline.batch_table import INTERRUPTED
-from pipeline.errors import NOT_TO_BE_USED
-from pipeline.publish import STAGE_FILE
+from pipeline.errors import INTERRUPTED_CODE, NOT_TO_BE_USED
+from pipeline.publish import STAGE_FILE, read_record, record_bytes
 
-INTERRUPTED_CODE = 130
 TOLD_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OUT_OF_MEMORY = (signal.SIGKILL, signal.SIGABRT)
 """How the system ends a program that asks for too much memory, and how libraries end theirs."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.publish import read_record
 from pipeline.study import open_study, studies_in
-from pipeline.study_files import LITTER
+from pipeline.study_files import cannot_be_entered, is_litter
 
 TABLE, LOGS = "batch.csv", "logs"
 """What a batch itself writes beside the patients' folders."""
@@ -52,7 +51,7 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
         direct = set(studies_in(studies))
         folders = sorted(path for path in studies.iterdir() if path.is_dir())
     except OSError as error:
-        raise InputError(_cannot_be_entered(error)) from error
+        raise InputError(cannot_be_entered(error)) from error
     here = out.resolve()
     looked_at = [
         one
@@ -71,7 +70,7 @@ def _plan(path: Path, direct: bool) -> Plan:
     try:
         inside = [path] if direct else studies_in(path)
     except OSError as error:
-        return Plan(path.name, path, refused=_cannot_be_entered(error))
+        return Plan(path.name, path, refused=cannot_be_entered(error))
     if not inside:
         return Plan(path.name, path, is_study=False)
     folder = inside[0] if len(inside) == 1 else path
@@ -80,14 +79,7 @@ def _plan(path: Path, direct: bool) -> Plan:
     except InputError:
         return Plan(path.name, folder)
     except OSError as error:
-        return Plan(path.name, folder, refused=_cannot_be_entered(error))
-
-
-def _cannot_be_entered(error: OSError) -> str:
-    return (
-        f"{error.filename}: cannot be entered ({error.strerror}); give yourself the right to read "
-        "it, or take it out"
-    )
+        return Plan(path.name, folder, refused=cannot_be_entered(error))
 
 
 def _require_out_elsewhere(studies: Path, out: Path, plans: Sequence[Plan]) -> None:
@@ -134,7 +126,7 @@ def notes_on(studies: Path, out: Path, plans: Sequence[Plan]) -> list[str]:
     except OSError:
         # Gone while the studies ran; what they left is told all the same.
         beside = []
-    loose = [one.name for one in beside if not one.is_symlink() and not _is_litter(one.name)]
+    loose = [one.name for one in beside if not one.is_symlink() and not is_litter(one.name)]
     dead = [one.name for one in beside if one.is_symlink() and not one.exists()]
     known = {one.patient_id or one.name for one in plans if one.is_study}
     known |= {products.name for one in plans if (products := products_of(out, one))}
@@ -145,10 +137,6 @@ def notes_on(studies: Path, out: Path, plans: Sequence[Plan]) -> list[str]:
         (others, f"{out}: also holds products that are of no study of this batch"),
     )
     return [f"{what}: {_named(names)}" for names, what in told if names]
-
-
-def _is_litter(name: str) -> bool:
-    return name.startswith(".") or name.lower() in LITTER
 
 
 def _named(names: Sequence[str]) -> str:
@@ -173,20 +161,3 @@ def _patients(out: Path) -> Iterable[Path]:
 
 def _is_of(products: Path, study: Path) -> bool:
     return read_record(products).get("study") == str(study.resolve())
-
-
-def read_record(products: Path | None) -> dict[str, Any]:
-    """What ``run.json`` says; nothing where there is none that can be read."""
-    try:
-        content = json.loads(record_bytes(products))
-    except ValueError:
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def record_bytes(products: Path | None) -> bytes:
-    """``run.json`` as it is; empty where there is none."""
-    try:
-        return (products / "run.json").read_bytes() if products else b""
-    except OSError:
-        return b""

@@ -20,7 +20,7 @@ from pipeline import __version__
 from pipeline.caches import provide_place
 from pipeline.console import BatchConsole, Console, show, tell
 from pipeline.ending import guarded
-from pipeline.errors import BeatfieldError, InputError
+from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
 from pipeline.summary import summary
 
@@ -169,7 +169,6 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
         How many studies to run at a time.
     """
     from pipeline.batch import run_batch
-    from pipeline.batch_ending import INTERRUPTED_CODE
     from pipeline.batch_table import NO_STUDY, table
     from pipeline.config import read_settings
 
@@ -278,11 +277,10 @@ def verify(fields: list[Path], /, *, surfaces: Path | None = None) -> int:
 
 
 def _verify(field: Path, surfaces: Path | None) -> None:
-    from pipeline.field.store import verify_field
+    from pipeline.field.verify import certificate_rows, verify_field
 
     show(f"{field}: {verify_field(field)}")
     if surfaces is not None:
-        from pipeline.field.verify import certificate_rows
         from pipeline.own_surfaces import measure_field
 
         measured = measure_field(field, surfaces, Console().progress)

@@ -10,7 +10,7 @@ from typing import Any
 from cyclopts import CycloptsError
 
 from pipeline.console import say, silence, tell, tell_notes
-from pipeline.errors import BeatfieldError
+from pipeline.errors import INTERRUPTED_CODE, BeatfieldError
 from pipeline.publish import NO_SPACE
 
 MORE_MEMORY = "use fewer --workers, raise `ulimit -v`, or take a larger machine"
@@ -44,5 +44,5 @@ def guarded(command: Callable[[], Any]) -> int:
     except KeyboardInterrupt as interrupt:
         say("interrupted; what is finished is kept")
         tell_notes(interrupt)
-        return 130
+        return INTERRUPTED_CODE
     return code if isinstance(code, int) else 0

@@ -7,6 +7,10 @@ NOT_TO_BE_USED = "do not use them for this one"
 """Ends a note on products of another run; by these words a batch knows that it was told."""
 
 
+INTERRUPTED_CODE = 130
+"""Exit code of a program that was told to end, as shells have it."""
+
+
 class BeatfieldError(Exception):
     """Any failure that the program can name; the command line turns it into an exit code."""
 

@@ -7,6 +7,7 @@ patient millimetres. Nothing here opens a file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,13 @@ def transform_points(target_from_source: Float, points: Float) -> Float:
     return moved
 
 
+def corners_apart_mm(mr_from_one: Float, mr_from_other: Float, counts: Sequence[int]) -> float:
+    """How far two placements put a corner of an array of ``(x, y, z)`` voxels apart, at most."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(counts) - 1)
+    moved = (mr_from_one - mr_from_other)[:3]
+    return float(np.linalg.norm(corners @ moved[:, :3].T + moved[:, 3], axis=1).max())
+
+
 def require_rigid(transform: Float, where: str) -> None:
     """Raise InputError unless ``transform`` is a rotation and a shift (finite, 1e-3 in angle)."""
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
@@ -56,6 +64,22 @@ def require_rigid(transform: Float, where: str) -> None:
             f"{where}: is not a rotation and a shift (its axes miss length 1 and right angles by "
             f"{off:.2g}, {_RIGID:g} is allowed), got\n{transform}{hint}"
         )
+
+
+def nearest_phase(phases: Float, phase: float) -> int:
+    """Number of the stored phase ``(n,)`` that is nearest to one, around the cycle."""
+    return int(np.abs((phases - phase + 0.5) % 1 - 0.5).argmin())
+
+
+def spread_over_triangle(count: int) -> Float:
+    """Shares ``(count, 3)`` of a triangle's corners that cover it evenly, the same every time.
+
+    Steps of the inverse plastic number and its square, even in the square (M. Roberts, "The
+    unreasonable effectiveness of quasirandom sequences", 2018), folded into the triangle.
+    """
+    u, v = (np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532) % 1).T
+    u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
+    return np.stack([1 - u - v, u, v], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +107,20 @@ class Grid:
         steps = np.array(self.shape[::-1]) - 1
         return np.asarray(self.origin_mm + steps * np.array(self.spacing_mm))
 
-    def nodes_mm(self) -> Float:
-        """Positions of all nodes, ``(z, y, x, 3)``."""
-        axes = [
-            origin + spacing * np.arange(count)
+    @property
+    def axes_mm(self) -> tuple[Float, Float, Float]:
+        """Coordinates of the nodes along x, y and z."""
+        x, y, z = (
+            np.asarray(origin + spacing * np.arange(count))
             for origin, spacing, count in zip(
                 self.origin_mm, self.spacing_mm, self.shape[::-1], strict=True
             )
-        ]
-        z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+        )
+        return x, y, z
+
+    def nodes_mm(self) -> Float:
+        """Positions of all nodes, ``(z, y, x, 3)``."""
+        z, y, x = np.meshgrid(*self.axes_mm[::-1], indexing="ij")
         return np.stack([x, y, z], axis=-1)
 
 

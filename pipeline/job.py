@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.progress import Progress
 from pipeline.publish import sealed
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Job:
     folder: Path
     """Where this stage writes."""
 
-    progress: Callable[[int, int], None]
+    progress: Progress
     """Told how much is done, of how much."""
 
     def product(self, stage: str) -> Path | None:

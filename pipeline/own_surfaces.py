@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,18 +22,16 @@ from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.files import read_metadata
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
-from pipeline.field.metadata import require_name, require_phases
+from pipeline.field.metadata import Transform, require_name, require_phases
 from pipeline.field.reader import ForceField
 from pipeline.field.winding import winding_number
 from pipeline.geometry import Surface, require_rigid
 from pipeline.meshes import MESH_ENDINGS, read_mesh
+from pipeline.progress import Progress
 from pipeline.publish import only_run_in, publishing, sha256_of
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
 from pipeline.validation import describe_validation
-
-Row = tuple[float, float, float, float]
-Transform = tuple[Row, Row, Row, Row]
 
 SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
 """From end to end; a heart in metres or micrometres lies outside."""
@@ -78,7 +76,7 @@ def bake_own_surfaces(
     folder: Path,
     out: Path,
     settings: Settings,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Bake the surfaces in a folder into ``out/field.zarr``, whole or not at all; return it.
 
@@ -172,9 +170,7 @@ def _wrong_shell(surface: Surface) -> str:
     return ""
 
 
-def measure_field(
-    path: Path, folder: Path, progress: Callable[[int, int], None] | None = None
-) -> dict[str, Any]:
+def measure_field(path: Path, folder: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Measure a baked field anew against the surfaces in a folder.
 
     Parameters
@@ -309,7 +305,7 @@ def read_own_surfaces(
     return OwnSurfaces(series, timing, digests)
 
 
-def _closed(path: Path) -> Any:
+def _closed(path: Path) -> Surface:
     surface = read_mesh(path)
     if not np.isfinite(surface.vertices_mm).all():
         raise InputError(f"{path}: has vertices that are no numbers; export the surface again")

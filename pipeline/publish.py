@@ -210,6 +210,23 @@ def write_whole(path: Path, text: str) -> None:
             partial.unlink(missing_ok=True)
 
 
+def read_record(products: Path | None) -> dict[str, Any]:
+    """What ``run.json`` says; nothing where there is none that can be read."""
+    try:
+        content = json.loads(record_bytes(products))
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def record_bytes(products: Path | None) -> bytes:
+    """``run.json`` as it is; empty where there is none."""
+    try:
+        return (products / "run.json").read_bytes() if products else b""
+    except OSError:
+        return b""
+
+
 def seal(folder: Path, fingerprint: str, figures: Mapping[str, Any]) -> None:
     """Write ``stage.json``: what went in, what was measured, and every file's digest."""
     files = {

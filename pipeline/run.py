@@ -7,7 +7,6 @@ goes on from the first stage that is not finished.
 from __future__ import annotations
 
 import importlib
-import json
 import platform
 import time
 from collections.abc import Mapping
@@ -25,6 +24,7 @@ from pipeline.publish import (
     library_versions,
     only_run_in,
     publishing,
+    read_record,
     remove,
     require_unaltered,
     seal,
@@ -317,7 +317,7 @@ def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], product
 
     A study may be moved, or its files exchanged where they are; not both at once.
     """
-    earlier = _recorded(products)
+    earlier = read_record(products)
     folder, known = earlier.get("study"), earlier.get("inputs")
     if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study.folder):
         return
@@ -334,17 +334,8 @@ def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], product
         )
 
 
-def _recorded(products: Path) -> Mapping[str, Any]:
-    """What ``run.json`` says, if there is one that can be read."""
-    try:
-        content = json.loads((products / "run.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def _earlier_stages(products: Path) -> Mapping[str, Any]:
-    stages = _recorded(products).get("stages")
+    stages = read_record(products).get("stages")
     return stages if isinstance(stages, dict) else {}
 
 

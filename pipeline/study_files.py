@@ -42,7 +42,7 @@ def files_below(path: Path) -> list[Path]:
             folders.clear()
             continue
         entered.add(place)
-        found += [Path(name, one) for one in files if not _is_litter(one)]
+        found += [Path(name, one) for one in files if not is_litter(one)]
     for one in found:
         if one.is_symlink() and not one.exists():
             raise InputError(f"{one}: is a link that leads nowhere; mend it, or take it out")
@@ -67,15 +67,21 @@ def _in_folder(folder: Path) -> list[Path]:
         _refuse(error)
 
 
-def _is_litter(name: str) -> bool:
+def is_litter(name: str) -> bool:
+    """Whether a file is of those that systems leave in folders."""
     return name.startswith(".") or name.lower() in LITTER
 
 
 def _refuse(error: OSError) -> NoReturn:
-    raise InputError(
+    raise InputError(cannot_be_entered(error)) from error
+
+
+def cannot_be_entered(error: OSError) -> str:
+    """What to say of a folder that the system keeps closed."""
+    return (
         f"{error.filename}: cannot be entered ({error.strerror}); give yourself the right to read "
         "it, or take it out"
-    ) from error
+    )
 
 
 def record_files(stem: Path | None) -> list[Path]:

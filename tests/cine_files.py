@@ -18,10 +18,12 @@ from pydicom.uid import (
 
 from pipeline.geometry import transform_points
 from pipeline.imaging.cine import Stack
+from pipeline.imaging.dicom import read_dicom_study
 
 Change = Callable[[FileDataset, int, int], bool]
 
 SLICES, PHASES, ROWS, COLUMNS = 4, 5, 6, 8
+ALL_FRAMES = [(number, phase) for number in range(SLICES) for phase in range(PHASES)]
 RR_MS = 800.0
 STEP_MM = 10.0
 
@@ -31,6 +33,11 @@ COLUMN_AXIS = np.array([0.0, 0.0, -1.0])
 NORMAL = np.cross(ROW_AXIS, COLUMN_AXIS)
 ORIGIN_MM = np.array([-50.0, 30.0, 12.5])
 PIXEL_MM = (1.5, 1.25)  # from row to row, from column to column
+
+
+def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
+    """The stack of a folder of DICOM files, without the views beside it."""
+    return read_dicom_study(folder, rr_ms)[0]
 
 
 def pixel_value(phase: int, number: int) -> Any:

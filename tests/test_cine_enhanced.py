@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cine_files import (
+    ALL_FRAMES,
     COLUMNS,
     NORMAL,
     ORIGIN_MM,
@@ -20,17 +21,15 @@ from cine_files import (
     in_series,
     item,
     pixel_value,
+    read_dicom_cine,
 )
 from pydicom.uid import generate_uid
 
 from pipeline.config import Settings
 from pipeline.errors import InputError
-from pipeline.imaging.dicom import read_dicom_cine
 from pipeline.job import Job
 from pipeline.stages import ingest
 from pipeline.study import open_study
-
-ALL_FRAMES = [(number, phase) for number in range(SLICES) for phase in range(PHASES)]
 
 
 def test_an_enhanced_object_a_slice_is_the_same_stack(tmp_path: Path) -> None:

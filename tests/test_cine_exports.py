@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from cine_files import (
+    ALL_FRAMES,
     NORMAL,
     ORIGIN_MM,
     PHASES,
@@ -22,6 +23,7 @@ from cine_files import (
     in_series,
     item,
     pixel_value,
+    read_dicom_cine,
     write_dicom,
 )
 from pydicom import dcmread
@@ -29,9 +31,6 @@ from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import MediaStorageDirectoryStorage
 
 from pipeline.errors import InputError
-from pipeline.imaging.dicom import read_dicom_cine
-
-ALL_FRAMES = [(number, phase) for number in range(SLICES) for phase in range(PHASES)]
 
 
 def beside_the_stack(folder: Path, others: list[FileDataset]) -> Path:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cine_files import (
+    ALL_FRAMES,
     COLUMN_AXIS,
     COLUMNS,
     NORMAL,
@@ -25,6 +26,7 @@ from cine_files import (
     enhanced_object,
     in_series,
     pixel_value,
+    read_dicom_cine,
     write_dicom,
 )
 from hypothesis import given, settings
@@ -38,13 +40,10 @@ from pydicom.uid import (
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.imaging.cine import stack_frames
-from pipeline.imaging.dicom import read_dicom_cine
 from pipeline.imaging.frames import Frame
 from pipeline.job import Job
 from pipeline.stages import ingest
 from pipeline.study import open_study
-
-ALL_FRAMES = [(number, phase) for number in range(SLICES) for phase in range(PHASES)]
 
 
 def resized(data: FileDataset, factor: int) -> FileDataset:

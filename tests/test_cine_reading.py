@@ -22,6 +22,7 @@ from cine_files import (
     dicom_frame,
     enhanced_object,
     pixel_value,
+    read_dicom_cine,
     write_dicom,
 )
 from hypothesis import given
@@ -30,7 +31,6 @@ from pydicom.dataset import FileDataset
 
 from pipeline.errors import InputError
 from pipeline.geometry import transform_points
-from pipeline.imaging.dicom import read_dicom_cine
 from pipeline.imaging.nifti import read_image, read_nifti_cine, read_nifti_views, write_image
 
 

@@ -349,7 +349,7 @@ def test_a_bad_field_does_not_hide_the_others(
             return "whole"
         raise (StageError if field.name == "late" else InputError)(f"{field.name}: cut short")
 
-    monkeypatch.setattr("pipeline.field.store.verify_field", verified)
+    monkeypatch.setattr("pipeline.field.verify.verify_field", verified)
     assert main(["verify", "bad", "late", "good"]) == 2
     printed, said = capsys.readouterr()
     assert printed == "good: whole\n"

@@ -4,40 +4,32 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
+from c_program import HERE, SANITIZE, build
 
 from pipeline.field import get_include
 from pipeline.registration.clock import KINDS, STATES, PhaseClock, to_cycle
 
-HERE = Path(__file__).parent
-STRICT = ["-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
-SANITIZE = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+DRIVER = HERE / "clock_driver.c"
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 
 
-def build(target, *options, compiler="gcc", language="c"):
-    command = [compiler, *STRICT, *options, f"-I{get_include()}", "-x", language]
-    subprocess.run([*command, str(HERE / "clock_driver.c"), "-o", str(target), "-lm"], check=True)
-    return target
-
-
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
-    return build(tmp_path_factory.mktemp("clock") / "driver", "-std=c99", *SANITIZE)
+    return build(DRIVER, tmp_path_factory.mktemp("clock") / "driver", "-std=c99", *SANITIZE)
 
 
 @pytest.mark.parametrize(
-    ("compiler", "standard", "language"),
-    [("gcc", "-std=c99", "c"), ("clang", "-std=c99", "c"), ("g++", "-std=c++11", "c++")],
+    ("compiler", "standard"),
+    [("gcc", "-std=c99"), ("clang", "-std=c99"), ("g++", "-std=c++11")],
 )
-def test_compiles_without_a_warning(tmp_path, compiler, standard, language):
+def test_compiles_without_a_warning(tmp_path, compiler, standard):
     if shutil.which(compiler) is None:
         pytest.skip(f"needs {compiler}")
-    build(tmp_path / "driver", standard, compiler=compiler, language=language)
+    build(DRIVER, tmp_path / "driver", standard, compiler=compiler)
 
 
 def stream(rng: np.random.Generator) -> np.ndarray:
@@ -150,16 +142,14 @@ def test_beats_as_near_to_each_other_as_their_spread_are_pythons(program):
 
 def test_a_clock_of_nonsense_is_never_valid_and_renders_nothing(tmp_path):
     (tmp_path / "wrong.c").write_text(NEVER_VALID)
-    command = ["gcc", "-std=c99", *STRICT, *SANITIZE, f"-I{get_include()}"]
-    program = tmp_path / "wrong"
-    subprocess.run([*command, tmp_path / "wrong.c", "-o", program, "-lm"], check=True)
+    program = build(tmp_path / "wrong.c", tmp_path / "wrong", "-std=c99", *SANITIZE)
     said = subprocess.run([program], capture_output=True, check=True, text=True).stdout.split("\n")
     assert said[:7] == ["0 1 0 0"] * 7
     assert said[7] == "1 1 0 1"
 
 
 def test_a_compiler_that_takes_no_numbers_for_numbers_is_refused(tmp_path):
-    command = ["gcc", "-ffast-math", f"-I{get_include()}", "-c", str(HERE / "clock_driver.c")]
+    command = ["gcc", "-ffast-math", f"-I{get_include()}", "-c", str(DRIVER)]
     done = subprocess.run(
         [*command, "-o", tmp_path / "out.o"], capture_output=True, check=False, text=True
     )
@@ -174,10 +164,7 @@ def test_phases_map_alike(tmp_path):
         "int main(void) { double q[3]; while (fread(q, sizeof q, 1, stdin) == 1) {"
         " double p = bf_to_cycle(q[0], q[1], q[2]); fwrite(&p, sizeof p, 1, stdout); } return 0; }"
     )
-    target = tmp_path / "map"
-    subprocess.run(
-        ["gcc", "-std=c99", *STRICT, f"-I{get_include()}", source, "-o", target, "-lm"], check=True
-    )
+    target = build(source, tmp_path / "map", "-std=c99")
     rng = np.random.default_rng(0)
     questions = np.column_stack(
         [rng.uniform(0, 1, 1000), rng.uniform(0.25, 2.5, 1000), np.full(1000, 0.85)]

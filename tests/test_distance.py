@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.field.distance import signed_distance
+from pipeline.field.distance import distance_of_closed, require_closed
 from pipeline.field.exact import vtk_distance
 from pipeline.geometry import Float, Grid, Integer, Surface
 
@@ -44,7 +44,7 @@ def test_sphere_is_exact_to_its_facets(level):
     surface, grid = sphere(25.0, level, centre=(3, -2, 1)), cube_grid(40, 17)
     exact = np.linalg.norm(grid.nodes_mm() - (3, -2, 1), axis=-1) - 25
 
-    error = signed_distance(surface, grid) - exact
+    error = distance_of_closed(surface, grid) - exact
 
     # An inscribed body: never nearer from outside, never deeper inside.
     assert error.min() >= -rounding(exact)
@@ -55,7 +55,7 @@ def test_torus_is_exact_to_its_facets():
     surface, grid = torus(20, 8, 90, 60), cube_grid(32, 24)
     exact = torus_distance(grid.nodes_mm(), 20, 8)
 
-    error = signed_distance(surface, grid) - exact
+    error = distance_of_closed(surface, grid) - exact
 
     assert np.abs(error).max() <= sag(surface, 8) + rounding(exact)
 
@@ -72,7 +72,7 @@ def test_box_is_exact(low, high):
     grid = cube_grid(14, 41)
     exact = box_distance(grid.nodes_mm(), low, high)
 
-    found = signed_distance(box(low, high), grid)
+    found = distance_of_closed(box(low, high), grid)
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
     clear = np.abs(exact) > 1e-6
@@ -84,7 +84,7 @@ def test_nodes_on_corners_edges_and_faces_are_exact():
     grid = Grid((13, 13, 13), (-6.0, -6.0, -6.0), (1.0, 1.0, 1.0))
     exact = box_distance(grid.nodes_mm(), (-4, -3, -2), (2, 3, 5))
 
-    found = signed_distance(box((-4, -3, -2), (2, 3, 5)), grid)
+    found = distance_of_closed(box((-4, -3, -2), (2, 3, 5)), grid)
 
     # Whole numbers and their square roots, in double precision until they are stored.
     np.testing.assert_allclose(found, exact, rtol=EPSILON, atol=1e-14)
@@ -98,7 +98,7 @@ def test_nearly_touching_sheets_keep_their_signs(gap):
     each = np.stack([box_distance(grid.nodes_mm(), *one) for one in (left, right)])
     exact = np.where((each < 0).any(axis=0), -1, 1) * np.abs(each).min(axis=0)
 
-    found = signed_distance(joined(box(*left), box(*right)), grid)
+    found = distance_of_closed(joined(box(*left), box(*right)), grid)
 
     np.testing.assert_allclose(np.abs(found), np.abs(exact), rtol=0, atol=rounding(exact))
     clear = np.abs(exact) > 1e-6
@@ -110,7 +110,7 @@ def test_overlapping_bodies_are_inside_as_one():
     grid = cube_grid(11, 23)
     each = np.stack([box_distance(grid.nodes_mm(), *body) for body in (one, two)])
 
-    found = signed_distance(joined(box(*one), box(*two)), grid)
+    found = distance_of_closed(joined(box(*one), box(*two)), grid)
 
     clear = np.abs(each).min(axis=0) > 1e-6
     assert ((found < 0) == (each < 0).any(axis=0))[clear].all()
@@ -126,9 +126,9 @@ def test_triangles_without_area_change_nothing():
     triangles = np.concatenate([np.delete(BOX_TRIANGLES, edge_owner, axis=0), split])
     grid = cube_grid(9, 25)
 
-    found = signed_distance(Surface(np.vstack([whole.vertices_mm, middle]), triangles), grid)
+    found = distance_of_closed(Surface(np.vstack([whole.vertices_mm, middle]), triangles), grid)
 
-    np.testing.assert_array_equal(found, signed_distance(whole, grid))
+    np.testing.assert_array_equal(found, distance_of_closed(whole, grid))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -136,7 +136,7 @@ def test_agrees_with_vtk(seed):
     surface, grid = lumpy(seed), cube_grid(40, 16)
     exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
-    found = signed_distance(surface, grid)
+    found = distance_of_closed(surface, grid)
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
@@ -151,7 +151,7 @@ def test_agrees_with_brute_force():
     grid = cube_grid(22, 11)
     points = grid.nodes_mm().reshape(-1, 3)
 
-    found = signed_distance(surface, grid).ravel()
+    found = distance_of_closed(surface, grid).ravel()
 
     exact = brute_distance(points, surface)
     np.testing.assert_allclose(np.abs(found), exact, rtol=0, atol=rounding(exact))
@@ -203,7 +203,7 @@ def test_moving_surface_and_points_together_changes_nothing(seed, turn, shift):
     carried_back = (grid.nodes_mm().reshape(-1, 3) - shift) @ rotation
     exact = vtk_distance(surface, carried_back).reshape(grid.shape)
 
-    found = signed_distance(moved(surface, rotation, np.array(shift)), grid)
+    found = distance_of_closed(moved(surface, rotation, np.array(shift)), grid)
 
     # Rounding of coordinates of up to 400 mm is far below that of the stored distance.
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
@@ -213,9 +213,9 @@ def test_moving_surface_and_points_together_changes_nothing(seed, turn, shift):
 def test_threads_and_repeats_give_the_same_bytes(threads):
     surface, grid = lumpy(5), cube_grid(35, 40)
 
-    alone = signed_distance(surface, grid, threads=1)
+    alone = distance_of_closed(surface, grid, threads=1)
 
-    assert signed_distance(surface, grid, threads=threads).tobytes() == alone.tobytes()
+    assert distance_of_closed(surface, grid, threads=threads).tobytes() == alone.tobytes()
 
 
 def some_nodes(grid: Grid, count: int, seed: int = 0) -> Integer:
@@ -235,7 +235,7 @@ def test_many_small_triangles_agree_with_vtk(spacing):
     some = some_nodes(grid, 1500)
     exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)[some])
 
-    found = signed_distance(surface, grid).ravel()[some]
+    found = distance_of_closed(surface, grid).ravel()[some]
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
@@ -251,7 +251,7 @@ def test_wall_of_half_a_millimetre_keeps_its_sign_and_distance():
     some = np.union1d(np.flatnonzero(np.abs(radius - 19.75) < 0.5), some_nodes(grid, 1000))
     exact = np.maximum(vtk_distance(outer, points[some]), -vtk_distance(inner, points[some]))
 
-    found = signed_distance(wall, grid).ravel()[some]
+    found = distance_of_closed(wall, grid).ravel()[some]
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(radius))
     assert (exact < 0).sum() > 100
@@ -263,7 +263,7 @@ def test_nodes_as_far_from_everything_find_the_nearest():
     surface, grid = sphere(25.0, 5), Grid((6, 7, 8), (-0.03, -0.02, -0.05), (0.01, 0.01, 0.01))
     exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
-    found = signed_distance(surface, grid)
+    found = distance_of_closed(surface, grid)
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
@@ -272,7 +272,7 @@ def test_surface_wholly_outside_the_grid():
     surface, grid = lumpy(2), Grid((9, 8, 7), (200.0, -350.0, 90.0), (1.0, 2.0, 0.5))
     exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
-    found = signed_distance(surface, grid)
+    found = distance_of_closed(surface, grid)
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
@@ -289,10 +289,10 @@ def test_slivers_are_exact(sliver):
     )
     grid = cube_grid(9, 25)
 
-    found = signed_distance(surface, grid)
+    found = distance_of_closed(surface, grid)
 
     # Half a unit in the last place of the coordinates is all that may change.
-    np.testing.assert_allclose(found, signed_distance(whole, grid), rtol=EPSILON, atol=1e-14)
+    np.testing.assert_allclose(found, distance_of_closed(whole, grid), rtol=EPSILON, atol=1e-14)
 
 
 @settings(max_examples=25, deadline=None)
@@ -310,7 +310,7 @@ def test_random_polyhedra_agree_with_brute_force(seed, corners, sizes, spacing):
     points = grid.nodes_mm().reshape(-1, 3)
     exact, winding = brute_distance(points, surface), winding_number(points, surface)
 
-    found = signed_distance(surface, grid).ravel()
+    found = distance_of_closed(surface, grid).ravel()
 
     np.testing.assert_allclose(np.abs(found), exact, rtol=EPSILON, atol=1e-12)
     # Solid angles are no good on the surface itself.
@@ -330,7 +330,7 @@ def test_surface_may_reach_beyond_the_grid():
     grid = Grid((9, 9, 9), (-4.0, -4.0, -4.0), (1.0, 1.0, 1.0))
     exact = box_distance(grid.nodes_mm(), (-30, -2.5, -30), (1.5, 30, 30))
 
-    found = signed_distance(box((-30, -2.5, -30), (1.5, 30, 30)), grid)
+    found = distance_of_closed(box((-30, -2.5, -30), (1.5, 30, 30)), grid)
 
     np.testing.assert_allclose(found, exact, rtol=0, atol=rounding(exact))
 
@@ -343,7 +343,7 @@ def test_uneven_triangles_are_found():
     points = grid.nodes_mm()
     each = np.stack([box_distance(points, (s, 0, 0), (1.5 * s, s / 2, s / 2)) for s in steps])
 
-    found = signed_distance(joined(*bodies), grid)
+    found = distance_of_closed(joined(*bodies), grid)
 
     np.testing.assert_allclose(np.abs(found), np.abs(each).min(axis=0), rtol=0, atol=EPSILON)
 
@@ -375,7 +375,7 @@ NAN[7, 1] = np.nan
 )
 def test_unusable_surfaces_are_refused(surface, words):
     with pytest.raises(InputError, match=rf"my\.stl: .*{words}"):
-        signed_distance(surface, cube_grid(12, 5), where="my.stl")
+        require_closed(surface, "my.stl")
 
 
 def test_vertices_that_lie_where_others_do_are_told():
@@ -384,4 +384,4 @@ def test_vertices_that_lie_where_others_do_are_told():
     corners_mm = whole.vertices_mm[whole.triangles.ravel()]
     apart = Surface(corners_mm, np.arange(len(corners_mm)).reshape(-1, 3))
     with pytest.raises(InputError, match=r"is not closed, 36 edges .*; merge the 28 vertices"):
-        signed_distance(apart, cube_grid(8, 9))
+        require_closed(apart, "my.stl")

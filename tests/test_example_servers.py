@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_program import build
 from field_baked import FIXTURES, PHASES, RADII_MM, bake_small
 
 from data_synth.ecg import EcgSettings, LostLead, phase_at, simulate_ecg, write_wfdb
 from pipeline.cli import main
-from pipeline.field import get_include
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 TIP_MM = (0.0, 25.0, 0.0)
@@ -82,17 +82,9 @@ def test_a_lead_that_falls_off_fades_the_force_out_at_the_bounded_rate(tmp_path,
     assert np.abs(np.diff(rows[:, 3])).max() * GUIDE.f_max_n < 0.01 + 2e-6
 
 
-def built(tmp_path, compiler, standard):
-    strict = ["-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", standard, f"-I{get_include()}"]
-    language = "c++" if compiler == "g++" else "c"
-    command = [compiler, *strict, "-x", language, str(EXAMPLES / "server.c")]
-    subprocess.run([*command, "-o", str(tmp_path / "server"), "-lm"], check=True)
-    return tmp_path / "server"
-
-
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_c_server_is_cpp_too(tmp_path):
-    assert built(tmp_path, "g++", "-std=c++11").exists()
+    build(EXAMPLES / "server.c", tmp_path / "server", "-std=c++11", compiler="g++")
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
@@ -101,7 +93,7 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
     peaks = tmp_path / "peaks.csv"
     assert main(["rpeaks", str(record), "--out", str(peaks)]) == 0
     words = [str(word) for word in (path, peaks, *TIP_MM)]
-    program = built(tmp_path, "gcc", "-std=c99")
+    program = build(EXAMPLES / "server.c", tmp_path / "server", "-std=c99")
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
     field, table_of_peaks, *point = words
     for given, told in (
@@ -147,7 +139,7 @@ GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200\n"
 )
 def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, row):
     head = "time_s,kind,valid,lead,rr_s,likeness,known_s\n"
-    program = built(tmp_path, "gcc", "-std=c99")
+    program = build(EXAMPLES / "server.c", tmp_path / "server", "-std=c99")
     words = [str(program), str(path), str(tmp_path / "peaks.csv"), *map(str, TIP_MM)]
     (tmp_path / "peaks.csv").write_text(f"{head}{GOOD_ROW}{row}\n{GOOD_ROW}")
     done = subprocess.run(words, capture_output=True, text=True, check=False)

@@ -18,7 +18,7 @@ from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
 from pipeline.field.exact import points_about, vtk_distance
 from pipeline.field.fixture import Bounds
 from pipeline.field.steps import largest_change, largest_steps
-from pipeline.field.store import verify_field
+from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field
 

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_program import HERE, SANITIZE, build
 
-from pipeline.field import ForceField, get_include
+from pipeline.field import ForceField
 from pipeline.field.batches import FEW, follow
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
 from pipeline.field.store import FieldWriter
 from pipeline.geometry import Float
 
-DRIVER = Path(__file__).parent / "field_batch_driver.c"
 ORIGIN_MM = (-3.0, 4.0, 5.5)
 SPACING_MM = (1.5, 2.0, 0.7)
 WAYS = {"four at a time": [], "one at a time": ["-DBEATFIELD_PLAIN"]}
@@ -93,11 +93,7 @@ def programs(tmp_path_factory):
         pytest.skip("needs a C compiler")
     folder = tmp_path_factory.mktemp("batch")
     for name, options in WAYS.items():
-        command = ["gcc", "-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", *options]
-        command += ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-        target = str(folder / name)
-        command += [f"-I{get_include()}", str(DRIVER), "-o", target, "-lm"]
-        subprocess.run(command, check=True)
+        build(HERE / "field_batch_driver.c", folder / name, "-std=c99", *SANITIZE, *options)
     return {name: folder / name for name in WAYS}
 
 

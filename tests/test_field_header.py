@@ -4,33 +4,22 @@ import json
 import os
 import random
 import shutil
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
+from c_program import HERE, SANITIZE, build, run
 from field_baked import FIXTURES, PHASES, bake_small
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.field import ForceField, get_include
+from pipeline.field import ForceField
 from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
 from pipeline.field.tool import Needle
 
-HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "docs" / "examples" / "query.c"
-STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
-SANITIZE = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
-
-
-def build(source: Path, target: Path, *options: str, compiler: str = "gcc") -> Path:
-    command = [compiler, "-O2", *STRICT, *options, f"-I{get_include()}"]
-    language = ["-x", "c++" if "++" in compiler else "c"]
-    subprocess.run([*command, *language, str(source), "-o", str(target), "-lm"], check=True)
-    return target
 
 
 @pytest.fixture(scope="module")
@@ -50,16 +39,6 @@ def watched(tmp_path_factory):
     """The same program, watched by the address and undefined-behaviour sanitizers."""
     target = tmp_path_factory.mktemp("c") / "watched"
     return build(HERE / "field_driver.c", target, "-std=c99", *SANITIZE)
-
-
-def run(program, *words, given=b"", **environment):
-    return subprocess.run(
-        [program, *map(str, words)],
-        input=given,
-        capture_output=True,
-        env={**os.environ, **environment},
-        check=False,
-    )
 
 
 @pytest.mark.parametrize(

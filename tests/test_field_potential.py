@@ -5,16 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.field.potential import (
-    GUIDANCE,
-    INSIDE,
-    OUTSIDE,
-    direction_scale,
-    offence,
-    potential,
-    pull,
-)
+from pipeline.field.potential import direction_scale, offence, potential, pull
 
+GUIDANCE, OUTSIDE, INSIDE = 0, 1, -1
 DELTA_MM = 6.0
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_program import HERE, SANITIZE, build, run
 from field_baked import bake_small
 from scipy.spatial.transform import Rotation
-from test_field_header import HERE, SANITIZE, build, run
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField, files, get_include

@@ -10,13 +10,12 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from cine_files import dicom_frame
+from cine_files import dicom_frame, read_dicom_cine
 from sweep_files import good_fields, write
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField, get_include
-from pipeline.field.store import verify_field
-from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.field.verify import verify_field
 from pipeline.imaging.ecg import patient_mark, read_ecg
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.ultrasound import read_sweep

@@ -22,7 +22,7 @@ from data_synth.mr import SyntheticCine
 from data_synth.protocol import MrSettings
 from data_synth.sampling import LONGEST_WINDOW
 from pipeline.geometry import transform_points
-from pipeline.imaging.dicom import read_dicom_cine
+from pipeline.imaging.dicom import read_dicom_study
 
 PHASES, ROWS, COLUMNS = 4, 20, 24
 RR_MS = (803.0, 817.0, 790.0, 811.0, 799.0)
@@ -288,7 +288,7 @@ def assert_same_place(image: Any, source: SyntheticCine, z: int) -> None:
 
 
 def test_the_pipeline_reads_the_stack_and_names_each_view_on_a_line(written: Written) -> None:
-    stack = read_dicom_cine(written.folder)
+    stack, _ = read_dicom_study(written.folder)
     np.testing.assert_array_equal(stack.cine.intensity, written.stack.intensity)
     # Slices are told apart along the images' normal, written with 12 digits.
     np.testing.assert_allclose(stack.cine.mr_from_index, written.stack.mr_from_index, atol=1e-8)

@@ -14,7 +14,7 @@ from ellipsoid_heart import (
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.registration.live import covariance_of, prepare_follower
+from pipeline.registration.live import prepare_follower
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
 
@@ -91,9 +91,7 @@ def test_frame_of_something_else_changes_nothing_but_the_certainty(prepared, lat
         drift = follower.follow(state, lattices[sweep], picture, place, phase)
         assert not drift.used
         assert np.array_equal(drift.state.mr_from_tracker, state.mr_from_tracker)
-        before, after = (
-            np.diag(covariance_of(one, follower.pivot)) for one in (state, drift.state)
-        )
+        before, after = (np.diag(one.covariance_mm2) for one in (state, drift.state))
         assert (after > before).all()
 
 

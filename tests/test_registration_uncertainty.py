@@ -13,6 +13,7 @@ from scipy.stats import chi
 
 from pipeline.geometry import transform_points
 from pipeline.registration import space
+from pipeline.registration.frames import Samples
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import AS_IT_IS, Size
@@ -245,8 +246,11 @@ class TestVerdict:
 
     def test_sweeps_of_a_registration_are_compared(self):
         borne_out = np.arange(40) < 20
-        level = SimpleNamespace(samples=SimpleNamespace(frames=40, number=np.arange(40)))
+        none = np.zeros(0, np.float32)
+        begins = np.zeros(41, np.int64)
+        samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS}
+        level = SimpleNamespace(samples=samples)
         found = SimpleNamespace(everything=level, bears_out=borne_out, **sure)
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)

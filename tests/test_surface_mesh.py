@@ -21,7 +21,6 @@ from pipeline.surface.mesh import (
     flipped,
     laplacian,
     largest_component,
-    triangle_quality,
     untangled,
     vertex_areas,
     vertex_normals,
@@ -57,10 +56,12 @@ def test_surface_is_a_solid_of_even_triangles(name, edge_mm):
     assert len(surface.vertices_mm) - len(surface.triangles) / 2 == 2
     assert crossing_triangles(surface) == 0
     corners = surface.vertices_mm[surface.triangles]
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    edges_of = corners - np.roll(corners, 1, axis=1)
+    edges = np.linalg.norm(edges_of, axis=2)
     # Density of marching cubes varies with direction between 1 and sqrt(3), the edge by its root.
     assert edges.mean() == pytest.approx(edge_mm, rel=0.15)
-    assert triangle_quality(surface.vertices_mm, surface.triangles).min() > 0.3
+    area = np.linalg.norm(np.cross(edges_of[:, 0], edges_of[:, 1]), axis=1) / 2
+    assert (4 * np.sqrt(3) * area / np.square(edges).sum(axis=1)).min() > 0.3
     assert np.abs(level.sample(surface.vertices_mm)[0]).max() < 0.05
 
 
@@ -119,12 +120,6 @@ def test_areas_and_normals_of_a_tetrahedron():
     assert areas[0] == pytest.approx(0.5)
     normals = vertex_normals(TETRAHEDRON.vertices_mm, TETRAHEDRON.triangles)
     np.testing.assert_allclose(normals[0], -np.ones(3) / np.sqrt(3))
-
-
-def test_quality_is_one_for_equilateral_and_nothing_for_a_line():
-    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, np.sqrt(3) / 2, 0], [2, 0, 0]])
-    found = triangle_quality(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
-    np.testing.assert_allclose(found, [1, 0], atol=1e-15)
 
 
 def test_untangling_mends_a_fold_and_touches_nothing_else():

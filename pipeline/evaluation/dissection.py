@@ -8,7 +8,7 @@ of the baked field, or nothing.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,11 +25,11 @@ from pipeline.evaluation.places import on_surface, settle
 from pipeline.field.files import map_phase, read_metadata, readable_in_fours
 from pipeline.field.fixture import DEVICES, DeviceName, Fixture
 from pipeline.field.reader import ForceField
-from pipeline.field.spline import timeline
+from pipeline.field.spline import grid_numbers, timeline
 from pipeline.field.tool import Needle, Polyline, Torus
 from pipeline.geometry import Float
+from pipeline.progress import Progress
 
-Progress = Callable[[int, int], None]
 ToolName = Literal["point", "needle", "torus"]
 
 PELLETS = 10
@@ -63,7 +63,8 @@ TOOLS: dict[ToolName, Any] = {
     "torus": Torus(shape="torus", radius_mm=10.0),
 }
 """Torque is about the tip, from where the rod carries it to the hand with the force."""
-TOUCHING = {"point": 1, "needle": 7, "torus": 12}
+TOUCHING = {"needle": 7, "torus": 12}
+"""Points of a tool that are watched for contact; of a point itself."""
 BOUND_N = 0.1
 
 
@@ -139,7 +140,7 @@ class Room:
             for k in range(len(metadata.phases))
         ]
         self._line = timeline(self.field.phases)
-        self._numbers = _grid_numbers(self.field)
+        self._numbers = grid_numbers(grid)
         self._addresses = np.array([one.ctypes.data for one in self._lifted], dtype=np.uintp)
         feet_mm, out = _patch(self.field, structure, seed)
         self.out = out.mean(axis=0) / np.linalg.norm(out.mean(axis=0))
@@ -165,13 +166,6 @@ class Room:
             LIFT_MM, WORKSPACE_MM, WITHDRAW_MM, self.field.rr_s, 0.0, condition.beating, MOST_S,
             tick_s,
         )  # fmt: skip
-
-
-def _grid_numbers(field: ForceField) -> Float:
-    """Origin, spacing, node counts and nodes a millimetre: see ``kernels.sample``."""
-    grid = field.grid
-    spacing = np.array(grid.spacing_mm)
-    return np.array([*grid.origin_mm, *spacing, *grid.shape[::-1], *(1 / spacing)])
 
 
 def guidance(structure: str, device: DeviceName) -> Fixture:
@@ -217,7 +211,8 @@ def shape_of(tool: ToolName) -> Shape:
     """A tool's lines, and the points of it that are watched for contact."""
     lines = TOOLS[tool].lines
     if tool == "needle":
-        touching = np.column_stack([np.zeros((7, 2)), np.linspace(0, TOOLS[tool].length_mm, 7)])
+        up_mm = np.linspace(0, TOOLS[tool].length_mm, TOUCHING[tool])
+        touching = np.column_stack([0 * up_mm, 0 * up_mm, up_mm])
     elif tool == "torus":
         angles = 2 * np.pi * np.arange(TOUCHING[tool]) / TOUCHING[tool]
         radius = TOOLS[tool].radius_mm

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.evaluation import dissection_forces, rod
 from pipeline.evaluation.compiled import asked, inner
-from pipeline.evaluation.dissection_values import MINDS, SUMS, Mind, Sum
+from pipeline.evaluation.dissection_values import MINDS, SUMS, TRACE_STEP_S, Mind, Sum
 from pipeline.evaluation.operators import EFFECTIVE_WIDTH
 from pipeline.field import kernels
 
@@ -28,8 +28,6 @@ HYSTERESIS_MM = 0.3
 LEAST_MOVE_S = 0.1
 PATIENCE_S = 0.1
 """Who is working on a pellet looks again after this."""
-
-TRACE_S = 0.01
 
 # What an operator is about to do when the time comes: reach, draw back, look where a reach ended.
 DECIDED, ALARMED, MOVING = 0.0, 1.0, 2.0
@@ -306,7 +304,7 @@ def _begin(task, waves, mind, plan, hand, tip, pose):  # type: ignore[no-untyped
 @inner
 def _record(task, tick, mind, tip, clear_mm, force, trace):  # type: ignore[no-untyped-def]
     """Every 10 ms a row of the trace, while there are rows."""
-    every = max(round(TRACE_S / task.tick_s), 1)
+    every = max(round(TRACE_STEP_S / task.tick_s), 1)
     if tick % every == 0 and tick // every < len(trace):
         row = trace[tick // every]
         row[0], row[4], row[8] = tick * task.tick_s, clear_mm, mind[Mind.PELLET]

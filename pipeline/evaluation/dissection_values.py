@@ -98,6 +98,8 @@ class Shape(NamedTuple):
 
 
 ENERGY_STEP_MM = 0.02
+TRACE_STEP_S = 0.01
+"""From row to row of a trial's trace."""
 
 
 class Mind(IntEnum):

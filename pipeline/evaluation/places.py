@@ -58,9 +58,8 @@ def on_surface(
     count: int,
     seed: int,
     towards: Float | None = None,
-    phase: float = 0.0,
 ) -> tuple[Float, Float]:
-    """Places of a baked surface from which one can leave it in a straight line.
+    """Places of a baked surface, at the R peak, from which one can leave it in a straight line.
 
     Parameters
     ----------
@@ -81,7 +80,7 @@ def on_surface(
     rng = np.random.default_rng(seed)
     feet, ways = np.empty((0, 3)), np.empty((0, 3))
     for _ in range(ROUNDS):
-        foot, way = _free_places(field, structure, rng, phase)
+        foot, way = _free_places(field, structure, rng)
         if towards is not None:
             facing = way @ (towards / np.linalg.norm(towards)) > np.cos(np.radians(CONE_DEG))
             foot, way = foot[facing], way[facing]
@@ -95,19 +94,19 @@ def on_surface(
 
 
 def _free_places(
-    field: ForceField, structure: str, rng: np.random.Generator, phase: float
+    field: ForceField, structure: str, rng: np.random.Generator
 ) -> tuple[Float, Float]:
     """Random places on the surface, with 10 mm of straight way out, and their directions out."""
     points = rng.uniform(np.array(field.grid.origin_mm), field.grid.upper_mm, size=(TRIED, 3))
-    near = np.abs(field.distance_mm(points, phase, structure)) < 12
-    points = settle(field, structure, points[near], phase)
-    good = np.abs(field.distance_mm(points, phase, structure)) < 1e-4
-    out = field.gradient(points, phase, structure)
+    near = np.abs(field.distance_mm(points, 0.0, structure)) < 12
+    points = settle(field, structure, points[near], 0.0)
+    good = np.abs(field.distance_mm(points, 0.0, structure)) < 1e-4
+    out = field.gradient(points, 0.0, structure)
     size = np.linalg.norm(out, axis=1)
     good &= np.abs(size - 1) < 1 - STRAIGHT
     out /= np.maximum(size, 0.5)[:, None]
     # A line that leaves straight is 10 mm away after 10 mm, and still inside the grid.
     ahead = points + FREE_MM * out
     good &= field.contains(ahead)
-    good &= np.abs(field.distance_mm(ahead, phase, structure) - FREE_MM) < 0.05 * FREE_MM
+    good &= np.abs(field.distance_mm(ahead, 0.0, structure) - FREE_MM) < 0.05 * FREE_MM
     return points[good], out[good]

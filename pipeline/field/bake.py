@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,7 @@ from pipeline.field.store import FieldWriter
 from pipeline.field.surface_fit import fit_to_surface
 from pipeline.field.threads import processors
 from pipeline.geometry import Float, Float32, Grid, Surface, require_rigid
+from pipeline.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ def bake_field(
     mr_from_tracker: Float | None = None,
     rr_s: float | None = None,
     source: Mapping[str, Any] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Bake distances and potentials of all phases into a new store, and measure it.
 
@@ -158,7 +159,7 @@ def _fit(
 
 
 class _Count:
-    def __init__(self, total: int, progress: Callable[[int, int], None] | None) -> None:
+    def __init__(self, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = 0, total, progress
 
     def step(self) -> None:
@@ -185,8 +186,7 @@ def _arrays(
 
 def potential_grid(distance_mm: Float32, fixture: Fixture) -> Float32:
     """Potential of a fixture on a grid of distances, rounded to what is stored."""
-    exact = np.float64(1) * distance_mm
-    q_mm = offence(exact, fixture.side_code)
+    q_mm = offence(distance_mm.astype(np.float64), fixture.side_code)
     rounded: Float32 = potential(q_mm, fixture.resolved_delta_mm, fixture.m).astype(np.float32)
     return rounded
 

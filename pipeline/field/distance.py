@@ -9,41 +9,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.field.threads import processors
-from pipeline.geometry import Float, Float32, Grid, Surface
-
-
-def signed_distance(
-    surface: Surface, grid: Grid, *, where: str = "surface", threads: int | None = None
-) -> Float32:
-    """Distance in mm from every grid node to the closest triangle, negative inside.
-
-    The magnitude is exact everywhere, near and far: triangles are left out only where others are
-    proven to be nearer. Inside is where the surface winds around a node, so sheets that touch or
-    overlap need no care. The result does not depend on the number of threads. Memory beyond the
-    result is half of it, for the signs, and about 0.25 kB a triangle, for the tree.
-
-    Parameters
-    ----------
-    surface
-        Closed, with outward normals.
-    grid
-        Nodes in the same frame.
-    where
-        What to call the surface in an error.
-    threads
-        How many to use; as many as there are processors when None.
-
-    Returns
-    -------
-    ``(z, y, x)`` array, mm.
-
-    Raises
-    ------
-    InputError
-        When the surface is open, faces inwards, or has vertices that are not numbers.
-    """
-    require_closed(surface, where)
-    return distance_of_closed(surface, grid, threads)
+from pipeline.geometry import Float32, Grid, Surface
 
 
 def require_closed(surface: Surface, where: str) -> None:
@@ -92,14 +58,33 @@ def require_usable_vertices(surface: Surface, where: str) -> None:
 
 
 def distance_of_closed(surface: Surface, grid: Grid, threads: int | None = None) -> Float32:
-    """``signed_distance`` of a surface that is known to be closed and to face outwards."""
+    """Distance in mm from every grid node to the closest triangle, negative inside.
+
+    The magnitude is exact everywhere, near and far: triangles are left out only where others are
+    proven to be nearer. Inside is where the surface winds around a node, so sheets that touch or
+    overlap need no care. The result does not depend on the number of threads. Memory beyond the
+    result is half of it, for the signs, and about 0.25 kB a triangle, for the tree.
+
+    Parameters
+    ----------
+    surface
+        Closed, with outward normals (`require_closed`).
+    grid
+        Nodes in the same frame.
+    threads
+        How many to use; as many as there are processors when None.
+
+    Returns
+    -------
+    ``(z, y, x)`` array, mm.
+    """
     from pipeline.field.nearest import TOP, block_distance, levels_of_blocks
     from pipeline.field.triangle_tree import plant
     from pipeline.field.winding import negate_inside
 
     vertices_mm = np.ascontiguousarray(surface.vertices_mm, dtype=np.float64)
     triangles = np.ascontiguousarray(surface.triangles, dtype=np.int64)
-    axes_mm = node_axes(grid)
+    axes_mm = grid.axes_mm
     threads = threads or processors()
     # Blocks at the end of the grid reach beyond it.
     beyond_mm = grid.upper_mm + TOP * np.array(grid.spacing_mm)
@@ -115,12 +100,3 @@ def distance_of_closed(surface: Surface, grid: Grid, threads: int | None = None)
         list(pool.map(fill, product(nz, ny, nx)))
     negate_inside(distance_mm, vertices_mm, triangles, axes_mm, threads)
     return distance_mm
-
-
-def node_axes(grid: Grid) -> tuple[Float, Float, Float]:
-    """Coordinates of the nodes along x, y and z, mm."""
-    x, y, z = (
-        np.asarray(grid.origin_mm[axis] + grid.spacing_mm[axis] * np.arange(grid.shape[2 - axis]))
-        for axis in range(3)
-    )
-    return x, y, z

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.field.files import chunk_path, map_phase, read_metadata, require_manifest
 from pipeline.field.metadata import FieldMetadata
-from pipeline.geometry import Float, Float32, Grid
+from pipeline.geometry import Float, Float32
 from pipeline.publish import publishing
 
 
@@ -65,7 +65,7 @@ class _Stored:
 
     def __init__(self, path: Path, about: FieldMetadata) -> None:
         self.path, self.about = path, about
-        self.grid = Grid(about.grid.shape_zyx, about.grid.origin_mm, about.grid.spacing_mm)
+        self.grid = about.grid.nodes()
         # Seconds where the heartbeat's length is known, else shares of it.
         self.beat = about.rr_s or 1.0
         self.times = [self.beat * phase for phase in about.phases]

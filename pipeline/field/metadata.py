@@ -11,11 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import DEVICES, Device, Fixture, Kind, Side
-from pipeline.geometry import require_rigid
+from pipeline.geometry import Grid, require_rigid
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 Row = tuple[float, float, float, float]
+Transform = tuple[Row, Row, Row, Row]
 
 INTERPOLATION = {
     "space": "quadratic B-spline whose coefficients are the arrays under spline/; beyond the "
@@ -43,6 +44,10 @@ class GridPart(Part):
     shape_zyx: tuple[int, int, int]
     origin_mm: tuple[float, float, float]
     spacing_mm: tuple[float, float, float]
+
+    def nodes(self) -> Grid:
+        """The grid that these numbers describe."""
+        return Grid(self.shape_zyx, self.origin_mm, self.spacing_mm)
 
 
 class StructurePart(Part):
@@ -138,7 +143,7 @@ class FieldMetadata(Part):
     phases: list[float] = Field(min_length=1)
     periodic: Literal[True] = True
     rr_s: float | None = Field(gt=0)
-    mr_from_tracker: tuple[Row, Row, Row, Row] | None
+    mr_from_tracker: Transform | None
     grid: GridPart
     structures: dict[str, StructurePart] = Field(min_length=1)
     fixtures: dict[str, FixturePart] = Field(min_length=1)

@@ -14,10 +14,6 @@ import numpy as np
 # A number or an array of them: NumPy and numba both evaluate the formulas below.
 Numbers = Any
 
-GUIDANCE = 0
-OUTSIDE = 1
-INSIDE = -1
-
 MEDIAL_GRADIENT = 0.5
 """Below this length of the distance's gradient the direction fades to zero."""
 

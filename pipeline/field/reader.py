@@ -30,7 +30,7 @@ from pipeline.field.questions import (
     require_answers,
     require_finite,
 )
-from pipeline.field.spline import timeline
+from pipeline.field.spline import grid_numbers, timeline
 from pipeline.field.threads import in_parts
 from pipeline.geometry import Float, Float32, Grid, Mask, require_rigid
 
@@ -77,12 +77,9 @@ class ForceField:
         self._fixtures = MappingProxyType(
             {name: part.fixture() for name, part in metadata.fixtures.items()}
         )
-        grid = metadata.grid
-        self._grid = Grid(grid.shape_zyx, grid.origin_mm, grid.spacing_mm)
+        self._grid = metadata.grid.nodes()
         self._phases = np.array(metadata.phases)
-        per_mm = 1 / np.array(grid.spacing_mm)
-        shape = grid.shape_zyx[::-1]
-        self._numbers = np.array([*grid.origin_mm, *grid.spacing_mm, *shape, *per_mm])
+        self._numbers = grid_numbers(self._grid)
         self._line = timeline(self._phases)
         parts = metadata.structures
         self._distances = {name: self._map(part.path) for name, part in parts.items()}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Grid
 
 
 def space_coefficients(values: Float) -> Float:
@@ -43,6 +43,12 @@ def node_values(coefficients: Float) -> Float:
         between = (lines[:-2] + 6 * lines[1:-1] + lines[2:]) / 8
         values = np.moveaxis(np.concatenate([lines[:1], between, lines[-1:]]), 0, axis)
     return values
+
+
+def grid_numbers(grid: Grid) -> Float:
+    """Origin, spacing, node counts and nodes a millimetre, each ``x, y, z``, for the kernels."""
+    spacing_mm = np.array(grid.spacing_mm)
+    return np.array([*grid.origin_mm, *spacing_mm, *grid.shape[::-1], *(1 / spacing_mm)])
 
 
 def timeline(phases: Float) -> Float:

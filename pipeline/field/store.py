@@ -15,13 +15,10 @@ from pipeline.field.files import chunk_path
 from pipeline.field.manifest import write_manifest
 from pipeline.field.metadata import FieldMetadata, attributes
 from pipeline.field.spline import time_solver
-from pipeline.field.verify import Report, verify_field
 from pipeline.geometry import Float32
 
 SLAB = 65_536
 """Nodes whose whole cycle is in memory at once."""
-
-__all__ = ["FieldWriter", "Report", "verify_field"]
 
 
 class FieldWriter:

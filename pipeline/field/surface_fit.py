@@ -21,7 +21,7 @@ from numba import njit
 
 from pipeline.field.motion import BeatingSurface, Motion, between
 from pipeline.field.spline import phase_weights, timeline
-from pipeline.geometry import Float, Float32, Grid, Integer, Surface
+from pipeline.geometry import Float, Float32, Grid, Integer, Surface, spread_over_triangle
 
 MOMENTS_A_PHASE = 3
 POINTS_A_CELL = 2.0
@@ -123,16 +123,12 @@ def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
     area = np.cumsum(np.linalg.norm(across, axis=1)) / 2
     count = int(np.ceil(POINTS_A_CELL * area[-1] / step_mm**2))
     chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
-    # An even sequence in the square (Roberts 2018: powers of the inverse of the plastic number),
-    # folded into the triangle.
-    u, v = (np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532) % 1).T
-    u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
     sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))
     edges = np.unique(sides, axis=0)[:, [0, 1, 1]]
     vertices = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
     # A mesh that is much finer than the grid has more of them than it takes.
     some = [one[:: max(1, len(one) // (2 * count))] for one in (vertices, edges)]
-    shares = [np.stack([1 - u - v, u, v], axis=1)]
+    shares = [spread_over_triangle(count)]
     shares += [np.tile((0.5, 0.25, 0.25), (len(one), 1)) for one in some]
     return np.concatenate([triangles[chosen], *some]), np.concatenate(shares)
 

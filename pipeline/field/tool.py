@@ -20,7 +20,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import Section
-from pipeline.geometry import Float, Grid, require_rigid, transform_points
+from pipeline.geometry import (
+    Float,
+    Grid,
+    require_rigid,
+    spread_over_triangle,
+    transform_points,
+)
 from pipeline.meshes import require_whole
 
 Point = tuple[float, float, float]
@@ -206,12 +212,8 @@ def spread_points(corners_mm: Float, count: int, where: str = "a tool's mesh") -
     if not area.sum() > 0:
         raise InputError(f"{where}: has no area; give triangles that have some")
     chosen = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(count) + 0.5) / count)
-    # Steps of the plastic number: low-discrepancy places in the unit square, folded to a triangle.
-    u = (0.7548776662466927 * np.arange(count)) % 1
-    v = (0.5698402909980532 * np.arange(count)) % 1
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    weights = np.column_stack([1 - u - v, u, v])
-    points: Float = np.einsum("nk,nkd->nd", weights, corners_mm[np.minimum(chosen, len(area) - 1)])
+    corners_mm = corners_mm[np.minimum(chosen, len(area) - 1)]
+    points: Float = np.einsum("nk,nkd->nd", spread_over_triangle(count), corners_mm)
     return points
 
 

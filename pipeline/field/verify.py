@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ class Report:
         )
 
 
-def verify_field(path: Path, progress: Callable[[int, int], None] | None = None) -> Report:
+def verify_field(path: Path) -> Report:
     """Check a field: manifest, files, checksums, description, values.
 
     Any changed, missing or added byte is found, the manifest's own included.
@@ -76,8 +76,6 @@ def verify_field(path: Path, progress: Callable[[int, int], None] | None = None)
     ----------
     path
         The ``field.zarr`` folder.
-    progress
-        Called with (done, total) while files and phases are read.
 
     Raises
     ------
@@ -88,7 +86,7 @@ def verify_field(path: Path, progress: Callable[[int, int], None] | None = None)
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
     files = _read_manifest(path / MANIFEST)
-    _refuse(path, list(_file_problems(path, files, progress)))
+    _refuse(path, list(_file_problems(path, files)))
     metadata = read_metadata(path)
     _refuse(path, [problem for name in metadata.arrays for problem in _array(path, name, metadata)])
     _refuse(path, list(_place_problems(path, metadata)))
@@ -153,11 +151,7 @@ def _read_manifest(source: Path) -> dict[str, dict[str, Any]]:
     return files
 
 
-def _file_problems(
-    path: Path,
-    files: Mapping[str, Mapping[str, Any]],
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[str]:
+def _file_problems(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     present = {
         file.relative_to(path).as_posix()
         for file in path.rglob("*")
@@ -165,8 +159,7 @@ def _file_problems(
     } - {MANIFEST}
     yield from (f"{name}: is missing" for name in sorted(set(files) - present))
     yield from (f"{name}: is not in the manifest" for name in sorted(present - set(files)))
-    both = sorted(present & set(files))
-    for done, name in enumerate(both, start=1):
+    for name in sorted(present & set(files)):
         try:
             actual = entry(path / name)
         except OSError as error:
@@ -174,8 +167,6 @@ def _file_problems(
             continue
         if actual != files[name]:
             yield _difference(name, actual, files[name])
-        if progress:
-            progress(done, len(both))
 
 
 def _difference(name: str, actual: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
@@ -213,7 +204,7 @@ def _place_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
 
 
 def _value_problems(path: Path, metadata: FieldMetadata) -> Iterator[str]:
-    grid = Grid(metadata.grid.shape_zyx, metadata.grid.origin_mm, metadata.grid.spacing_mm)
+    grid = metadata.grid.nodes()
     for index in range(len(metadata.phases)):
         for name, structure in metadata.structures.items():
             values = map_phase(path / structure.path, index, grid)
@@ -260,8 +251,7 @@ def _spline_problems(
 ) -> Iterator[str]:
     """At the nodes of every phase the spline must take the stored distances, but for the stated
     correction: weights are positive with sum 1, so no value changes by more than a coefficient."""
-    grid = Grid(metadata.grid.shape_zyx, metadata.grid.origin_mm, metadata.grid.spacing_mm)
-    phases = metadata.phases
+    grid, phases = metadata.grid.nodes(), metadata.phases
     k, weights = phase_weights(timeline(np.array(phases)), phases[index])
     coefficients = np.zeros(grid.shape)
     for step, weight in zip((-1, 0, 1), weights, strict=True):

@@ -121,7 +121,7 @@ def stack_frames(
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
     phases = common_phases(triggers, rr_ms, where)
-    mr_from_index = _placement(slices[0][0], step_mm)
+    mr_from_index = placement(slices[0][0], step_mm)
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
@@ -316,7 +316,8 @@ def _intensity(slices: Sequence[Sequence[Frame]]) -> Float32:
     return intensity
 
 
-def _placement(first: Frame, step_mm: Float) -> Float:
+def placement(first: Frame, step_mm: Float) -> Float:
+    """4x4 from the first slice's image, and from one slice to the next: ``(x, y, z)`` to mm."""
     mr_from_index = np.eye(4)
     mr_from_index[:3, 0] = first.axes[0] * first.spacing_mm[0]
     mr_from_index[:3, 1] = first.axes[1] * first.spacing_mm[1]

@@ -11,10 +11,8 @@ from scipy import ndimage
 
 from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.auricle import join_auricle
-from pipeline.imaging.labels import LABELS, most_probable
+from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE, most_probable
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
-
-CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""

@@ -43,33 +43,27 @@ UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
 PHASE_IMAGES = {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"}
 
 
-def read_dicom_cine(folder: Path, rr_ms: float | None = None) -> Stack:
-    """Read every DICOM file below ``folder``, classic or Enhanced, as one cine stack.
+def read_dicom_study(
+    folder: Path, rr_ms: float | None = None, fill: bool = False
+) -> tuple[Stack, tuple[LongAxis, ...]]:
+    """Read every DICOM file below ``folder``, classic or Enhanced: one cine stack, and the
+    long-axis views that lie beside it (`pipeline.imaging.long_axis_series.long_axis_views`).
 
     The folder may hold other images too (long-axis views, localisers, derived images, reports):
-    they are listed in the stack's ``left_out``. `read_dicom_study` gives the views too.
+    they are listed in the stack's ``left_out``.
 
     Parameters
     ----------
     rr_ms
         Overrides the files' own RR interval.
+    fill
+        Let the mean of both neighbours stand in for a slice that is missing.
 
     Raises
     ------
     InputError
         When a file is not readable or truncated, an MR image has no place in space, the stack's
         images have no trigger time, or they do not make up a regular stack.
-    """
-    return read_dicom_study(folder, rr_ms)[0]
-
-
-def read_dicom_study(
-    folder: Path, rr_ms: float | None = None, fill: bool = False
-) -> tuple[Stack, tuple[LongAxis, ...]]:
-    """As `read_dicom_cine`, with the long-axis views that lie beside the stack.
-
-    ``fill`` lets the mean of both neighbours stand in for a slice that is missing.
-    Which images are such views, `pipeline.imaging.long_axis_series.long_axis_views` says.
     """
     paths = [path for path in files_below(folder) if path.name.upper() not in DIRECTORY_NAMES]
     if not paths:
@@ -115,8 +109,8 @@ def _require_dicom(paths: Sequence[Path]) -> None:
         )
 
 
-def _names(paths: Sequence[Path], most: int = 8) -> str:
-    return ", ".join([*(path.name for path in paths[:most]), *(["..."] * (len(paths) > most))])
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join([*(path.name for path in paths[:8]), *(["..."] * (len(paths) > 8))])
 
 
 def _begins_as_dicom(path: Path) -> bool:

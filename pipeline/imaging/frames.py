@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -120,10 +121,6 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
         else:
             _refuse(stack[0], others[0], where)
     return stack, left_out
-
-
-def _first(pair: tuple[Rank, list[Frame]]) -> Rank:
-    return pair[0]
 
 
 def slice_positions(frames: Sequence[Frame]) -> Float:
@@ -254,7 +251,7 @@ def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
         enough = any(one is other for other in stacks)
         original = one[0].kind == ORIGINAL
         ranked.append(((enough, max(along, default=0), original, len(one), per_mm2), one))
-    return sorted(ranked, key=_first, reverse=True)
+    return sorted(ranked, key=itemgetter(0), reverse=True)
 
 
 def _weight(frames: Sequence[Frame]) -> int:

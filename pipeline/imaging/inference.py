@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,8 +20,7 @@ from pipeline.imaging.network import (
     predict,
 )
 from pipeline.imaging.view import View
-
-Progress = Callable[[int, int], None]
+from pipeline.progress import Progress
 
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
@@ -105,7 +104,7 @@ def network_images(
 
 
 def label_probability(
-    cine: Cine, view: View, most_views: int = 1, progress: Progress | None = None
+    cine: Cine, view: View, most_views: int, progress: Progress | None = None
 ) -> PlaneProbability:
     """Probabilities of all classes in all phases on the planes that the slices give.
 
@@ -140,7 +139,7 @@ def _kept(planes: int) -> slice:
     return slice(None) if planes == PLANES else slice(PLANES // 2, PLANES // 2 + 1)
 
 
-def _predicted(cine: Cine, view: View, phase: int, turn_deg: float, alone: bool = False) -> Float32:
+def _predicted(cine: Cine, view: View, phase: int, turn_deg: float, alone: bool) -> Float32:
     """Probabilities ``(slice, plane, class, row, column)`` on the view, seen turned."""
     seen = view.varied(turn_deg) if turn_deg else view
     chance = predict(network_images(cine, seen, phase, range(len(view.order)), alone=alone))

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
-from pipeline.imaging.labels import most_probable
-from pipeline.imaging.tapering import CAVITY, LID_MM, MUSCLE, taper_ventricle
+from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
+from pipeline.imaging.tapering import LID_MM, taper_ventricle
 
 BAND_MM = 4.0
 """Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its

@@ -16,6 +16,9 @@ LABELS: dict[str, int] = {
 }
 """Structure name to label value; 0 is everything else."""
 
+CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
+"""Of the left ventricle."""
+
 
 def most_probable(chance: Float32, axis: int = 1) -> Label:
     """The class of the largest value along an axis, the first of equal ones.

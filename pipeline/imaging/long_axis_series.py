@@ -9,7 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine
+from pipeline.geometry import Float
+from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, placement
 from pipeline.imaging.frames import (
     MIN_PHASES,
     NEAREST_SLICES_MM,
@@ -58,7 +59,7 @@ def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...
     return tuple(view for view in found if view is not None)
 
 
-def _cosine(frame: Frame, normal: np.typing.NDArray[np.float64]) -> float:
+def _cosine(frame: Frame, normal: Float) -> float:
     return abs(float(frame.normal @ normal))
 
 
@@ -95,10 +96,6 @@ def _view(frames: Sequence[Frame]) -> LongAxis | None:
     inside = phases[0] >= 0 and phases[-1] < 1 and low_s < rr_ms / 1000 < high_s
     if len(ordered) < MIN_PHASES or not rising or not inside:
         return None
-    mr_from_index = np.eye(4)
-    mr_from_index[:3, 0] = first.axes[0] * first.spacing_mm[0]
-    mr_from_index[:3, 1] = first.axes[1] * first.spacing_mm[1]
-    mr_from_index[:3, 2] = first.normal
-    mr_from_index[:3, 3] = first.position_mm
     intensity = np.stack([np.asarray(frame.pixels, np.float32) for frame in ordered])[:, None]
-    return LongAxis(first.series, Cine(intensity, mr_from_index, phases, rr_ms / 1000))
+    place = placement(first, first.normal)
+    return LongAxis(first.series, Cine(intensity, place, phases, rr_ms / 1000))

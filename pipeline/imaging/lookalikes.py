@@ -7,9 +7,8 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.geometry import Float, Float32, Mask
-from pipeline.imaging.labels import LABELS, most_probable
+from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE, most_probable
 
-VENTRICLE = (LABELS["lv_cavity"], LABELS["lv_myocardium"])
 AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
 
 OPENINGS = ("left_atrium", "aorta")
@@ -78,7 +77,7 @@ def favour_right_ventricle(value: Float32) -> None:
 def ventricle_cuts(value: Float32) -> Float:
     """Pixels of the left ventricle on each plane, mean over the phases."""
     drawn = (most_probable(probability) for probability in value)
-    cuts = [np.isin(labels, VENTRICLE).sum(axis=(1, 2)) for labels in drawn]
+    cuts = [np.isin(labels, (CAVITY, MUSCLE)).sum(axis=(1, 2)) for labels in drawn]
     return np.asarray(np.mean(cuts, axis=0))
 
 

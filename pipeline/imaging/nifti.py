@@ -16,7 +16,7 @@ from nibabel.filebasedimages import ImageFileError
 from nibabel.spatialimages import HeaderDataError
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float
+from pipeline.geometry import Float, corners_apart_mm
 from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.limits import require_bounded
@@ -30,7 +30,7 @@ VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
 
 SAME_PLACE_MM = 0.5
-"""By which a header's two placements may differ: less than a pixel."""
+"""By which two placements of one stack may differ: less than a pixel."""
 
 OBLONG = 4
 """With more slices than this times the columns or rows, the axes are in another order."""
@@ -235,9 +235,7 @@ def _doubts_of_place(image: Any) -> tuple[str, ...]:
         )
     if sform == 0 or qform == 0:
         return ()
-    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape[:3]) - 1)
-    difference = by_sform[:3] - by_qform[:3]
-    off_mm = np.linalg.norm(corners @ difference[:, :3].T + difference[:, 3], axis=1).max()
+    off_mm = corners_apart_mm(by_sform, by_qform, image.shape[:3])
     if off_mm <= SAME_PLACE_MM:
         return ()
     return (

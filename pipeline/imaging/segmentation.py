@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +27,7 @@ from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import clear_apex, favour_right_ventricle
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import Orientation, View
-
-Progress = Callable[[int, int], None]
+from pipeline.progress import Progress
 
 LARGEST_BARE = 0.5
 """Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""

@@ -16,9 +16,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from pipeline.geometry import Float, Float32, Integer
-from pipeline.imaging.labels import LABELS
-
-CAVITY, MUSCLE = LABELS["lv_cavity"], LABELS["lv_myocardium"]
+from pipeline.imaging.labels import CAVITY, MUSCLE
 
 TAPER_MM = 20.0
 """How a body tapers towards the tip is told by its cuts this near to the last one."""

@@ -16,7 +16,7 @@ from pipeline.evaluation.dissection import guidance
 from pipeline.evaluation.places import settle
 from pipeline.evaluation.tracing import trace_along
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, Float32, MovingSurface, transform_points
+from pipeline.geometry import Float, Float32, MovingSurface, nearest_phase, transform_points
 from pipeline.imaging.ultrasound import Sweep, read_sweeps
 from pipeline.paper.moving import animated
 from pipeline.paper.subject import Subject
@@ -175,8 +175,8 @@ def _frames(scene: Scene) -> Iterator[Figure]:
 def _draw(axis: Axes, scene: Scene, frame: int, which: int) -> None:
     image, transform = scene.images[frame], scene.image_from_mr[frame]
     show_grey(axis, image)
-    away = np.abs((scene.surface.phases - scene.phases[frame] + 0.5) % 1 - 0.5)
-    cut = plane_cut(scene.surface.at(int(away.argmin())), transform)
+    nearest = nearest_phase(scene.surface.phases, scene.phases[frame])
+    cut = plane_cut(scene.surface.at(nearest), transform)
     axis.add_collection(LineCollection(list(cut), colors="w", linewidths=1.6))
     now = int(np.searchsorted(scene.ticks_s, scene.times_s[frame]))
     now = min(now, len(scene.ticks_s) - 1)

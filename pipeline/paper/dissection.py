@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,15 +11,14 @@ from matplotlib.figure import Figure
 
 from pipeline.evaluation import dissection as task
 from pipeline.evaluation.dissection import Condition, Room, interval
-from pipeline.evaluation.dissection_values import Sum
+from pipeline.evaluation.dissection_values import TRACE_STEP_S, Sum
 from pipeline.evaluation.operators import POPULATION
 from pipeline.field.fixture import DeviceName
 from pipeline.geometry import Float
 from pipeline.paper.subject import Subject
+from pipeline.progress import Progress
 from pipeline.report.page import Section, Table, picture
 from pipeline.report.style import as_svg
-
-Progress = Callable[[int, int], None]
 
 PAPER_S = ((211, 90), (225, 86))
 """Mean times without and with force in the paper's Table 1: 3'31", 1'30"; 3'45", 1'26"."""
@@ -175,9 +173,9 @@ def _paths(room: Room, seed: int) -> bytes:
     _draw_room(picture_axis, room, centre, across)
     looks = ((None, "no force", "#D55E00", "-"), (fixture, "guided", "#0072B2", "--"))
     for force, name, colour, style in looks:
-        rows = int(TRACE_S / 0.01)
+        rows = int(TRACE_S / TRACE_STEP_S)
         trial = task.run_trial(room, Condition("point", True, force), seed, 0, rows)
-        trace = trial.trace[: min(int(trial.sums[Sum.TIME] / 0.01), rows)]
+        trace = trial.trace[: min(int(trial.sums[Sum.TIME] / TRACE_STEP_S), rows)]
         away = trace[:, 1:4] - centre
         picture_axis.plot(away @ across, away @ room.out, style, color=colour, linewidth=0.8)
         clear_axis.plot(trace[:, 0], trace[:, 4], style, color=colour, linewidth=0.9, label=name)

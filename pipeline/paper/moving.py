@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 
-def animated(figures: Iterable[Figure], seconds: float, dots_per_inch: int = 80) -> bytes:
+def animated(figures: Iterable[Figure], seconds: float, dots_per_inch: int) -> bytes:
     """Animated WebP, endless, that takes ``seconds`` for all figures; the same bytes every time."""
     images = []
     for figure in figures:

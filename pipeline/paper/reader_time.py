@@ -29,7 +29,7 @@ def percentiles_us(work: Callable[[int], object], ticks: int) -> Float:
     return np.percentile(spent, SHARES) / 1000
 
 
-def reader_time(subject: Subject, seed: int, ticks: int = TICKS) -> Section:
+def reader_time(subject: Subject, seed: int) -> Section:
     """Percentiles of one question, as a loop in Python asks it."""
     field = subject.field
     fixture = next(iter(field.fixtures))
@@ -39,7 +39,7 @@ def reader_time(subject: Subject, seed: int, ticks: int = TICKS) -> Section:
     ]
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, 3] = points
-    rows = [("point", percentiles_us(lambda n: field.force_at(*places[n % len(places)]), ticks))]
+    rows = [("point", percentiles_us(lambda n: field.force_at(*places[n % len(places)]), TICKS))]
     for name in ("needle", "torus"):
         tool = TOOLS[name]
 
@@ -47,13 +47,13 @@ def reader_time(subject: Subject, seed: int, ticks: int = TICKS) -> Section:
             k = n % len(places)
             return field.tool_force(tool, poses[k], places[k][3])  # type: ignore[arg-type]
 
-        rows.append((name, percentiles_us(whole, ticks // 10)))
+        rows.append((name, percentiles_us(whole, TICKS // 10)))
     head = ["tool", *[f"{share:g} %" if share < 100 else "longest" for share in SHARES]]
     lines = [(name, *[f"{value:.1f} µs" for value in found]) for name, found in rows]
     return Section(
         "The loop's budget",
         "Time of one question to the reader from Python, measured while this page was made, on a "
-        f"machine that may have had other work: {ticks:,} ticks at scattered places (a tenth for "
+        f"machine that may have had other work: {TICKS:,} ticks at scattered places (a tenth for "
         "tools). A tick of 1 kHz is 1000 µs. The longest are the system's interruptions, which a "
         "real-time system would not have.",
         tables=[Table(head, lines)],

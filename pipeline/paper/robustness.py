@@ -15,10 +15,9 @@ from pipeline.field.reader import ForceField
 from pipeline.geometry import Float
 from pipeline.paper.laws import LOOKS
 from pipeline.paper.subject import Subject
+from pipeline.progress import Progress
 from pipeline.report.page import Section, Table, picture
 from pipeline.report.style import as_svg, words
-
-Progress = Callable[[int, int], None]
 
 SHIFTS_MM = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 LATE_MS = (0.0, 10.0, 25.0, 50.0, 75.0, 100.0)

@@ -44,20 +44,15 @@ class Subject:
         InputError
             When a fixture names a surface that is not in the field.
         """
-        return with_fixtures(self.field_path, fixtures)
-
-
-def with_fixtures(path: Path, fixtures: Mapping[str, Fixture]) -> ForceField:
-    """A field whose forces are those of ``fixtures``; see ``Subject.with_fixtures``."""
-    metadata = read_metadata(path)
-    for name, fixture in fixtures.items():
-        if fixture.structure not in metadata.structures:
-            raise InputError(
-                f"{path}: fixture {name} acts from {fixture.structure!r}, which is not baked; "
-                f"there are {', '.join(metadata.structures)}"
-            )
-    parts = {name: FixturePart.of(name, fixture) for name, fixture in fixtures.items()}
-    return ForceField(path, metadata.model_copy(update={"fixtures": parts}))
+        metadata = read_metadata(self.field_path)
+        for name, fixture in fixtures.items():
+            if fixture.structure not in metadata.structures:
+                raise InputError(
+                    f"{self.field_path}: fixture {name} acts from {fixture.structure!r}, which is "
+                    f"not baked; there are {', '.join(metadata.structures)}"
+                )
+        parts = {name: FixturePart.of(name, fixture) for name, fixture in fixtures.items()}
+        return ForceField(self.field_path, metadata.model_copy(update={"fixtures": parts}))
 
 
 def open_subject(products: Path, study: Path | None = None) -> Subject:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.dissection import TOOLS
+from pipeline.evaluation.dissection import PORT, TOOLS
 from pipeline.evaluation.places import on_surface, settle
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float
@@ -172,7 +172,7 @@ class _Scene:
     def __init__(self, field: ForceField, fixture: str, seed: int) -> None:
         self.field, self.fixture = field, fixture
         self.structure = field.fixtures[fixture].structure
-        feet, out = on_surface(field, self.structure, 1, seed, np.array([0.8, -0.55, 0.2]))
+        feet, out = on_surface(field, self.structure, 1, seed, PORT)
         self.frame = frame_about(out[0])
         self.centre = feet[0]
         self.pose = np.eye(4)

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from pipeline.errors import InputError
 from pipeline.paper import dissection, laws, robustness
 from pipeline.paper.constrained_motion import constrained_motion
@@ -19,10 +17,10 @@ from pipeline.paper.reader_time import reader_time
 from pipeline.paper.slice_through_the_beat import slice_through_the_beat
 from pipeline.paper.subject import Subject, open_subject
 from pipeline.paper.torus_tool import torus_tool
+from pipeline.progress import Progress
 from pipeline.publish import publishing
-from pipeline.report.page import Section
+from pipeline.report.page import Section, filled
 
-Progress = Callable[[int, int], None]
 Make = Callable[[Subject, int, int, Progress], Section]
 
 MARK = "paper.txt"
@@ -206,20 +204,13 @@ def _lacking(experiment: Experiment, subject: Subject) -> str | None:
 
 def render(subject: Subject, parts: Sequence[Part], notes: Sequence[str]) -> str:
     """The page as HTML; text is escaped."""
-    templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-    )
     beside = [
         Beside(one.what, one.paper, one.here, part.command)
         for part in parts
         for one in (EXPERIMENTS[part.name],)
     ]
-    return templates.get_template("page.html.j2").render(
-        source=str(subject.field_path), notes=notes, beside=beside, parts=parts
-    )
+    source, folder = str(subject.field_path), Path(__file__).parent
+    return filled(folder, source=source, notes=notes, beside=beside, parts=parts)
 
 
 def _write_files(folder: Path, part: Part) -> None:

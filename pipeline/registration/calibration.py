@@ -30,6 +30,7 @@ from pipeline.registration.uncertainty import (
     FrameLosses,
     frame_curvatures,
     in_radians,
+    rising,
     sandwich,
     slopes_at,
 )
@@ -286,7 +287,7 @@ def _expansion(
     counts for nothing where slopes cancel, as they do at the optimum.
     """
     sweep, sweeps = calibration.sweep[placed.samples.number], len(calibration.names)
-    worth = _worth(Curvature(slopes, _rising(bending.sum(axis=0))), sweep, error_mm)
+    worth = _worth(Curvature(slopes, rising(bending.sum(axis=0))), sweep, error_mm)
     lifts = calibration.lifts(placed, pose)
     slope, of_frames = np.zeros((1 + sweeps, 6)), np.zeros((6 + 6 * sweeps, 6 + 6 * sweeps))
     slope[0] = worth * slopes.sum(axis=0)
@@ -297,16 +298,10 @@ def _expansion(
         both = np.concatenate([np.tile(np.eye(6), (mine.sum(), 1, 1)), lifts[mine]], axis=2)
         where = np.concatenate([np.arange(6), np.arange(6) + 6 * (1 + number)])
         bent = np.einsum("fia,fij,fjb->ab", both, bending[mine], both)
-        of_frames[np.ix_(where, where)] += worth * _rising(bent)
+        of_frames[np.ix_(where, where)] += worth * rising(bent)
     of_frames[:6, :6] += worth * _FLATTEST * np.eye(6)
     of_belief = np.diag(np.concatenate([np.zeros(6), np.tile(calibration.belief_mm**-2, sweeps)]))
     return _Expansion(slope.ravel(), of_frames, of_belief, worth)
-
-
-def _rising(bending: Float) -> Float:
-    """The symmetric matrix without what bends downwards."""
-    values, vectors = np.linalg.eigh((bending + bending.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
 
 
 def _worth(curvature: Curvature, sweep: Integer, error_mm: float) -> float:

@@ -20,7 +20,8 @@ from pipeline.geometry import Float, Integer
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Best, Level, Search
-from pipeline.registration.time import phases_at, summarise_rr
+from pipeline.registration.time import median_rr_s, phases_at
+from pipeline.registration.uncertainty import REACH, long_run
 
 Choice = Literal["apply", "measure", "ignore"]
 
@@ -41,8 +42,6 @@ _PROFILE_S = 0.025
 _ROUNDS = 4
 # Share of the best score that an offset elsewhere may reach; beyond, the frames do not tell which.
 _ELSEWHERE_S, _EQUAL_RIVAL = 0.100, 0.95
-# Up to which share of a sweep's frames neighbours count as correlated, as for the pose.
-_REACH = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ class Timing:
 
         A frame that the offset puts outside the R peaks stays at their end.
         """
-        rr_s = summarise_rr(self.r_times_s).median_s
+        rr_s = median_rr_s(self.r_times_s)
         first, last = self.r_times_s[0] - 0.999 * rr_s, self.r_times_s[-1] + 0.999 * rr_s
         times_s = np.concatenate(self.times_s)[number] - offset_s
         return phases_at(np.clip(times_s, first, last), self.r_times_s, self.cycle_rr_s)
@@ -224,7 +223,7 @@ class _Profile:
     def _scan(self, pose: Float) -> tuple[float, float]:
         """The best offset within half a beat to either side, at one pose; and the share of its
         score that an offset elsewhere reaches."""
-        most = int(summarise_rr(self.timing.r_times_s).median_s / 2 / _SCAN_S)
+        most = int(median_rr_s(self.timing.r_times_s) / 2 / _SCAN_S)
         offsets_s = _SCAN_S * np.arange(-most, most + 1)
         scores = np.array([self.at(float(one)).score(pose) for one in offsets_s])
         top = int(scores.argmax())
@@ -245,15 +244,7 @@ class _Profile:
         return offset_s + step_s, float(np.sqrt(self._spread(slopes)) / bending)
 
     def _spread(self, slopes: Float) -> float:
-        """Variance of the sum of the frames' slopes; neighbours of one sweep err together, with
-        weights that fall linearly with the distance between them (Newey and West 1987)."""
-        ends = np.cumsum([len(times_s) for times_s in self.timing.times_s])
-        sweep = np.searchsorted(ends, self.level.samples.number, side="right")
-        away, total = slopes - slopes.mean(), 0.0
-        for number in np.unique(sweep):
-            own = away[sweep == number]
-            lags = min(len(own) - 1, max(1, round(_REACH * len(own))))
-            products = np.correlate(own, own, "full")[len(own) - 1 :][: lags + 1]
-            weights = 1 - np.arange(lags + 1) / (lags + 1)
-            total += products[0] + 2 * float(products[1:] @ weights[1:])
-        return max(total, float(away @ away))
+        """Variance of the sum of the frames' slopes; neighbours of one sweep err together."""
+        sweep = self.level.samples.sweep([len(times_s) for times_s in self.timing.times_s])
+        away = slopes - slopes.mean()
+        return max(float(long_run(away[:, None], sweep, REACH)[0, 0]), float(away @ away))

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
-from numba import njit
-
-from pipeline.compiled import kept_with
+from pipeline.compiled import door
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -18,8 +16,8 @@ _SOURCES = ("detector_state", "waves", "quality", "levels", "rules", "qrs", "tic
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Compile a numeric function to machine code; the result is kept on disk between runs."""
-    with kept_with(Path(__file__).parent, _SOURCES):
-        # Only what Python calls needs a way in from there, which would be compiled too.
-        inner = function.__name__.startswith("_")
-        made = njit(cache=True, nogil=True, no_cpython_wrapper=inner, no_cfunc_wrapper=True)
-        return cast("Callable[Parameters, Result]", made(function))
+    # Only what Python calls needs a way in from there, which would be compiled too.
+    inner = function.__name__.startswith("_")
+    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": inner}
+    made = door(Path(__file__).parent, _SOURCES, **options)
+    return cast("Callable[Parameters, Result]", made(function))

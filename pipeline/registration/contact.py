@@ -22,8 +22,9 @@ _ALONG_MM = 15.0
 # Share of the cells' variance that range does not explain. Of the phantom's pictures it is 0.07 or
 # less in air, noise and haze alone, and 0.20 or more in a body.
 _LEAST_BESIDE = 0.12
-# A sector that widens by less than this a millimetre has parallel beams.
-_PARALLEL = 0.05
+# A sector that widens by less than this a millimetre has parallel beams, which fan out from a point
+# so many of its heights above it.
+_PARALLEL, _FAR = 0.05, 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +74,8 @@ def _apex_mm(sector: Mask, pixel_mm: Float) -> float:
     # Below its widest row a fan ends in an arc, and the highest ones may be the probe's own.
     widest = int(width_mm.argmax())
     some = slice(widest // 4, widest + 1)
-    if widest < 4:
-        return -1e3 * float(np.ptp(y_mm) + 1)
-    slope, offset_mm = np.polyfit(y_mm[some], width_mm[some], 1)
-    return float(-offset_mm / slope) if slope > _PARALLEL else -1e3 * float(np.ptp(y_mm) + 1)
+    slope, offset_mm = np.polyfit(y_mm[some], width_mm[some], 1) if widest >= 4 else (0.0, 0.0)
+    return float(-offset_mm / slope if slope > _PARALLEL else -_FAR * (np.ptp(y_mm) + 1))
 
 
 def _cosines(range_mm: Float) -> Float:

@@ -92,6 +92,10 @@ class Samples:
         """How many frames there are."""
         return len(self.phases)
 
+    def sweep(self, sizes: Sequence[int]) -> Integer:
+        """``(frames,)`` number of each frame's sweep, of sweeps of so many frames each."""
+        return np.searchsorted(np.cumsum(sizes), self.number, side="right")
+
 
 def sample_frames(
     sweeps: Sequence[TrackedSweep],

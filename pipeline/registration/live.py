@@ -30,7 +30,7 @@ from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import agreement
 from pipeline.registration.space import Registration
 from pipeline.registration.tissue_map import TissueMap
-from pipeline.registration.uncertainty import curvature_at, in_radians, sandwich
+from pipeline.registration.uncertainty import curvature_at, rising, sandwich
 
 # A step of one frame beyond this is no drift but an outlier; it is cut to this length.
 _LONGEST_STEP_MM = 1.0
@@ -122,8 +122,7 @@ class Follower:
         if samples.frames == 0:
             return self._drift(replace(state, covariance_mm2=waited), used=False)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
-        used = explained > 0.5 * state.usual
-        if not used:
+        if not explained > 0.5 * state.usual:
             return self._drift(replace(state, covariance_mm2=waited), used=False)
         usual = state.usual + 0.1 * (explained - state.usual)
         step, covariance = self._update(samples, state.mr_from_tracker, waited)
@@ -138,11 +137,10 @@ class Follower:
             return np.log1p(-agreement(samples, self.tissue, moved).explained)
 
         curvature = curvature_at(losses)
-        values, vectors = np.linalg.eigh(curvature.bending)
         # Where one frame's loss bends the wrong way it says nothing.
-        bending = (vectors * np.maximum(values, 0)) @ vectors.T
+        bending = rising(curvature.bending)
         information = np.linalg.inv(prior_mm2) + self.information_of_loss * bending
-        covariance = np.linalg.inv(information)
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         step = -self.information_of_loss * covariance @ curvature.slopes[0]
         length = float(np.linalg.norm(step))
         return step * min(1.0, _LONGEST_STEP_MM / max(length, 1e-12)), covariance
@@ -183,8 +181,8 @@ def prepare_follower(
         return level.losses(search.pivot.move(pose, step_mm))
 
     curvature = curvature_at(losses)
-    ends = np.cumsum([len(sweep.images) for sweep in sweeps])
-    spread = sandwich(curvature, np.searchsorted(ends, level.samples.number, side="right"))
+    sweep = level.samples.sweep([len(one.images) for one in sweeps])
+    spread = sandwich(curvature, sweep)
     follower = Follower(search.fine, search.pivot, pose, information_of(spread, curvature.bending))
     lengths_mm = settings.sample_spacing_mm, settings.smoothing_mm, settings.trend_mm
     lattices = [lattice_of(sweep, *lengths_mm) for sweep in sweeps]
@@ -198,8 +196,3 @@ def information_of(covariance_mm2: Float, bending: Float) -> float:
     """Information per unit of curvature: so much that all frames' curvature together, ``(6, 6)``,
     is worth what the estimate's covariance says it was."""
     return float(6 / np.trace(covariance_mm2 @ bending))
-
-
-def covariance_of(state: LiveState, pivot: Pivot) -> Float:
-    """``(6, 6)`` covariance of the state, mm and rad, as a registration gives it."""
-    return in_radians(state.covariance_mm2, pivot)

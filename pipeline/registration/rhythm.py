@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.publish import readable_write_errors
+from pipeline.publish import write_whole
 from pipeline.registration.clock import Kind, PhaseClock
 from pipeline.registration.rpeaks import Beat, RPeakDetector, with_end_held
 
@@ -112,7 +113,7 @@ def doubt(beats: Sequence[RhythmBeat]) -> str:
 
 
 def write_rhythm(
-    path: Path, beats: Sequence[RhythmBeat], leads: Sequence[str], start_s: float = 0.0
+    path: Path, beats: Sequence[RhythmBeat], leads: Sequence[str], start_s: float
 ) -> None:
     """Write one row a beat as CSV; the file is there whole or not at all.
 
@@ -130,19 +131,12 @@ def write_rhythm(
     InputError
         When the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
+    text = io.StringIO(newline="")
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_COLUMNS)
+    table.writerows(_cells(one, leads, start_s) for one in beats)
     try:
-        with readable_write_errors(path):
-            try:
-                with part.open("w", newline="", encoding="utf-8") as file:
-                    table = csv.writer(file, lineterminator="\n")
-                    table.writerow(_COLUMNS)
-                    for one in beats:
-                        table.writerow(_cells(one, leads, start_s))
-                part.replace(path)
-            finally:
-                # Where nothing may be written, this is refused as well.
-                part.unlink(missing_ok=True)
+        write_whole(path, text.getvalue())
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); name a file in a folder that exists"

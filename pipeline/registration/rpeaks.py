@@ -12,6 +12,7 @@ import statistics
 from collections import deque
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -173,7 +174,7 @@ def find_beats(signal_mv: Float, sampling_rate_hz: float) -> list[Beat]:
         beats.append(beat)
     end_s = (len(signal_mv) - 1) / sampling_rate_hz
     # The few that were overdue became known after a later one.
-    return sorted((beat for beat in beats if 0 <= beat.time_s <= end_s), key=_time_of)
+    return sorted((beat for beat in beats if 0 <= beat.time_s <= end_s), key=attrgetter("time_s"))
 
 
 def with_end_held(signal_mv: Float, sampling_rate_hz: float) -> Float:
@@ -193,10 +194,6 @@ def _is_strange(likeness: float, others: Collection[float]) -> bool:
     usual = statistics.median(others)
     scatter = _DEVIATION * statistics.median(abs(other - usual) for other in others)
     return likeness < max(ALIKE, usual - max(LEAST_MARGIN, SCATTERS * scatter))
-
-
-def _time_of(beat: Beat) -> float:
-    return beat.time_s
 
 
 def _plan(rate_hz: float) -> Plan:

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import InputError, StageError, UnregistrableError
-from pipeline.geometry import Float, Integer, Mask, MovingSurface, require_rigid
+from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
+from pipeline.progress import Progress
 from pipeline.registration.breathing import follow_breath
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
@@ -45,8 +46,6 @@ _STEPS = 5
 _LACKING = 0.2
 # Of each surface, to look at the expected error.
 _POINTS = 200
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,14 +312,9 @@ def _breathing(
     """Frames, pose and each frame's displacement along the breathing axis, if breath was free."""
     if search.settings.breath == "hold":
         return level, pose, np.zeros(level.samples.frames)
-    sweep = _sweep_of(level, sizes)
+    sweep = level.samples.sweep(sizes)
     placed, pose, breath_mm = follow_breath(level, pose, search.pivot, sweep)
     return placed, _refined(placed, pose, search), breath_mm
-
-
-def _sweep_of(level: Level, sizes: Sequence[int]) -> Integer:
-    """``(frames,)`` number of each frame's sweep."""
-    return np.searchsorted(np.cumsum(sizes), level.samples.number, side="right")
 
 
 def _covariance(
@@ -330,7 +324,7 @@ def _covariance(
     and what corrections of calibrations leave open; and these corrections."""
     judged = _judged(found.everything, found.bears_out, search.settings)
     curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
-    spread = in_radians(sandwich(curvature, _sweep_of(judged, sizes)), search.pivot)
+    spread = in_radians(sandwich(curvature, judged.samples.sweep(sizes)), search.pivot)
     floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
     floor += in_radians(found.size.error_mm**2 * np.eye(6), search.pivot)
     if found.calibration is None:
@@ -382,7 +376,7 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
     sure, valid = (found.confidence, found.rival), int(found.bears_out.sum())
-    against = outvoted(_sweep_of(level, sizes), found.bears_out, settings.min_frames)
+    against = outvoted(level.samples.sweep(sizes), found.bears_out, settings.min_frames)
     # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
     shown = level.samples.frames
     travelled = shift_mm, turn_deg

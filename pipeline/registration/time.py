@@ -7,8 +7,6 @@ of one nominal beat, the MR's: systole keeps its length when the rate changes an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.errors import InputError
@@ -24,23 +22,6 @@ _SLOWEST_FRAME_S = 1.0
 # Beats of one heart resemble their usual beat; what is cut out of noise at its own maxima does so
 # with 0.3 to 0.5 in the median.
 _LEAST_LIKENESS = 0.7
-
-
-@dataclass(frozen=True, slots=True)
-class RrSummary:
-    """How fast and how evenly the heart beat."""
-
-    beats: int
-    """Number of R peaks."""
-
-    median_s: float
-    """Half of the RR intervals are shorter."""
-
-    shortest_s: float
-    """The shortest RR interval."""
-
-    longest_s: float
-    """The longest RR interval."""
 
 
 def detect_r_peaks(signal_mv: Float, sampling_rate_hz: float) -> Float:
@@ -104,7 +85,7 @@ def phases_at(times_s: Float, r_times_s: Float, cycle_rr_s: float | None = None)
     >>> phases_at(np.array([0.25, 1.0, 1.25, 2.5]), np.array([1.0, 2.0, 3.0]))
     array([0.25, 0.  , 0.25, 0.5 ])
     """
-    rr_s = summarise_rr(r_times_s).median_s
+    rr_s = median_rr_s(r_times_s)
     times = np.asarray(times_s, dtype=float)
     starts = np.concatenate([[r_times_s[0] - rr_s], r_times_s])
     ends = np.append(r_times_s, r_times_s[-1] + rr_s)
@@ -139,8 +120,8 @@ def _other_clock(times_s: Float, start_s: float, end_s: float) -> str:
     return ""
 
 
-def summarise_rr(r_times_s: Float) -> RrSummary:
-    """Number of beats, and the median, shortest and longest RR interval.
+def median_rr_s(r_times_s: Float) -> float:
+    """Median RR interval between ``(beats,)`` R times, seconds.
 
     Raises
     ------
@@ -153,8 +134,7 @@ def summarise_rr(r_times_s: Float) -> RrSummary:
             f"needs two R peaks or more with rising times, got {len(r_times_s)} "
             f"({(~(rr_s > 0)).sum()} of them not after the one before)"
         )
-    median_s = float(np.median(rr_s))
-    return RrSummary(len(r_times_s), median_s, float(rr_s.min()), float(rr_s.max()))
+    return float(np.median(rr_s))
 
 
 def _require_record(signal_mv: Float, sampling_rate_hz: float) -> None:

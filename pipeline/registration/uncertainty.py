@@ -27,6 +27,8 @@ FrameLosses = Callable[[Float], Float]
 
 # Wide enough to look past the kinks that linear interpolation leaves at every node.
 _STEP_MM = 1.0
+REACH = 0.25
+"""Up to which share of a sweep's frames neighbours count as correlated."""
 # Errors that are drawn to count how many stay small.
 _DRAWS = 4000
 # A loss flatter than this, of all frames together, per square millimetre leaves its direction
@@ -79,7 +81,7 @@ def _either_side(losses: FrameLosses) -> tuple[Float, Float]:
     return ahead, np.stack([losses(-step) for step in steps], axis=1)
 
 
-def sandwich(curvature: Curvature, sweep: Integer, reach: float = 0.25) -> Float:
+def sandwich(curvature: Curvature, sweep: Integer, reach: float = REACH) -> Float:
     """``(6, 6)`` covariance of the estimate, square millimetres of `Pivot.move`.
 
     Parameters
@@ -94,9 +96,7 @@ def sandwich(curvature: Curvature, sweep: Integer, reach: float = 0.25) -> Float
     """
     frames = len(sweep)
     slopes = curvature.slopes - curvature.slopes.mean(axis=0)
-    spread = np.zeros((6, 6))
-    for number in np.unique(sweep):
-        spread += _long_run(slopes[sweep == number], reach)
+    spread = long_run(slopes, sweep, reach)
     # Six parameters were fitted to these slopes: they are smaller than true errors would be.
     spread *= frames / max(frames - 6, 1)
     inverse = _inverse(curvature.bending)
@@ -104,14 +104,25 @@ def sandwich(curvature: Curvature, sweep: Integer, reach: float = 0.25) -> Float
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _long_run(slopes: Float, reach: float) -> Float:
-    """Covariance of the sum of a row of correlated slopes (Bartlett's weights)."""
-    total = slopes.T @ slopes
-    lags = min(len(slopes) - 1, max(1, round(reach * len(slopes))))
-    for lag in range(1, lags + 1):
-        shared = slopes[lag:].T @ slopes[:-lag]
-        total += (1 - lag / (lags + 1)) * (shared + shared.T)
-    return np.asarray(total)
+def long_run(slopes: Float, sweep: Integer, reach: float) -> Float:
+    """``(k, k)`` covariance of the sum of the frames' slopes ``(frames, k)`` of mean 0, neighbours
+    of one sweep being correlated (Bartlett's weights); ``sweep`` and ``reach`` as in `sandwich`."""
+    total = np.zeros((slopes.shape[1],) * 2)
+    for number in np.unique(sweep):
+        own = slopes[sweep == number]
+        spread = own.T @ own
+        lags = min(len(own) - 1, max(1, round(reach * len(own))))
+        for lag in range(1, lags + 1):
+            shared = own[lag:].T @ own[:-lag]
+            spread += (1 - lag / (lags + 1)) * (shared + shared.T)
+        total += spread
+    return total
+
+
+def rising(bending: Float) -> Float:
+    """The symmetric part of a matrix without what bends downwards."""
+    values, vectors = np.linalg.eigh((bending + bending.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)
 
 
 def _inverse(bending: Float) -> Float:
@@ -139,9 +150,9 @@ def floor_of(error_mm: float, bending: Float, pivot: Pivot) -> Float:
 def expected_tre_mm(covariance: Float, centre_mm: Float, points_mm: Float) -> Float:
     """Root mean square target registration error that a covariance lets expect at points.
 
-    The covariance is carried to each point by the rigid motion's own derivative, as in J. M.
-    Fitzpatrick, J. B. West and C. R. Maurer, "Predicting error in rigid-body point-based
-    registration", IEEE Trans Med Imaging 17 (1998) 694-702, for any covariance.
+    The covariance is carried to each point by the rigid motion's own derivative, as A. Danilchenko
+    and J. M. Fitzpatrick do for point registration ("General approach to first-order error
+    prediction in rigid point registration", IEEE Trans Med Imaging 30 (2011) 679-693).
 
     Parameters
     ----------

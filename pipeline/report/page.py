@@ -103,12 +103,23 @@ def render(
     notes: Sequence[str] = (),
 ) -> str:
     """The page as HTML; text is escaped."""
+    folder = Path(__file__).parent
+    return filled(
+        folder,
+        patient_id=patient_id,
+        summary=summary,
+        sections=sections,
+        example=example,
+        notes=notes,
+    )
+
+
+def filled(folder: Path, **values: Any) -> str:
+    """The template ``page.html.j2`` of a folder with values in it, all of which it must get."""
     templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader(folder),
         autoescape=True,
         undefined=StrictUndefined,
         keep_trailing_newline=True,
     )
-    return templates.get_template("page.html.j2").render(
-        patient_id=patient_id, summary=summary, sections=sections, example=example, notes=notes
-    )
+    return templates.get_template("page.html.j2").render(values)

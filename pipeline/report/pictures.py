@@ -13,7 +13,14 @@ from matplotlib.image import AxesImage
 from pipeline.field.fixture import Fixture
 from pipeline.field.potential import potential
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, Float32, MovingSurface, Surface, transform_points
+from pipeline.geometry import (
+    Float,
+    Float32,
+    MovingSurface,
+    Surface,
+    nearest_phase,
+    transform_points,
+)
 from pipeline.imaging.labels import LABELS
 from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
@@ -83,9 +90,9 @@ def cuts_on_ultrasound(
             if name not in surfaces:
                 continue
             moving = surfaces[name]
-            away = np.abs((moving.phases - phase + 0.5) % 1 - 0.5)
             # Joined, for dashes begin anew with every piece, and pieces are shorter than they.
-            lines = joined(plane_cut(moving.at(int(away.argmin())), transform))
+            nearest = moving.at(nearest_phase(moving.phases, phase))
+            lines = joined(plane_cut(nearest, transform))
             axis.add_collection(
                 LineCollection(lines, colors=colour, linestyles=style, linewidths=1.2)
             )

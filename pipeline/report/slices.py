@@ -38,18 +38,18 @@ class Doubt(NamedTuple):
     lowest: float
 
 
-def shown_slices(labels: Label, always: Sequence[int] = (), most: int = MOST_SLICES) -> Integer:
+def shown_slices(labels: Label, always: Sequence[int]) -> Integer:
     """Numbers of the slices to show, of ``(phase, z, y, x)`` labels, rising.
 
-    All where there are no more than ``most``; else those of ``always``, and an even choice from
-    the first slice with a label to the last, ends included.
+    All where there are no more than `MOST_SLICES`; else those of ``always``, and an even choice
+    from the first slice with a label to the last, ends included.
     """
     count = labels.shape[1]
-    if count <= most:
+    if count <= MOST_SLICES:
         return np.arange(count)
     used = np.flatnonzero((labels > 0).any(axis=(0, 2, 3)))
     first, last = (used[0], used[-1]) if len(used) else (0, count - 1)
-    even = np.linspace(first, last, most - len(always)).round().astype(np.int64)
+    even = np.linspace(first, last, MOST_SLICES - len(always)).round().astype(np.int64)
     return np.union1d(even, np.array(always, np.int64))
 
 

@@ -17,8 +17,9 @@ from pipeline.evaluation.metrics import (
     target_registration_error_mm,
 )
 from pipeline.evaluation.motion import motion_error
-from pipeline.geometry import Label, MovingSurface, Surface
+from pipeline.geometry import Label, MovingSurface, Surface, corners_apart_mm
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.nifti import SAME_PLACE_MM
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
 from pipeline.products import read_frames, read_labels, read_surfaces, read_table, write_table
@@ -38,9 +39,6 @@ REFERENCE = 0
 
 # Points per surface and phase; the mean distance of 4000 stratified samples repeats to 0.02 mm.
 SAMPLES = 4000
-
-SAME_PLACE_MM = 0.5
-"""By which headers of one stack may differ: less than a pixel."""
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -136,9 +134,7 @@ def _labels(job: Job, truth: Path) -> tuple[Label, Label]:
             f"{truth}: its labels are {known.shape} (phase, slice, row, column), those found are "
             f"{found.shape}; truth and cine must be of one study"
         )
-    corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(found.shape[:0:-1]) - 1)
-    moved = (mr_from_found - mr_from_known)[:3]
-    off_mm = np.linalg.norm(corners @ moved[:, :3].T + moved[:, 3], axis=1).max()
+    off_mm = corners_apart_mm(mr_from_found, mr_from_known, found.shape[:0:-1])
     if off_mm > SAME_PLACE_MM:
         raise InputError(
             f"{truth}: its labels lie up to {off_mm:.1f} mm beside those found, at most "

@@ -20,7 +20,7 @@ from pipeline.imaging.faults import (
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.job import Job
 from pipeline.products import write_cine
-from pipeline.registration.time import detect_r_peaks, summarise_rr
+from pipeline.registration.time import detect_r_peaks, median_rr_s
 
 WIDEST_STEP, MOST_STEPS = 0.25, 3.0
 """Share of a beat between two phases, and times the usual step, beyond which it is told: gating
@@ -88,14 +88,14 @@ def _doubts_of_beat(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
     if ecg is None:
         return doubts
     try:
-        beats = summarise_rr(detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz))
+        beat_s = median_rr_s(detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz))
     except InputError:
         # In a scanner that may be: nothing else reads this record.
         return doubts
-    if not 1 / OTHER_RATE <= rr_s / beats.median_s <= OTHER_RATE:
+    if not 1 / OTHER_RATE <= rr_s / beat_s <= OTHER_RATE:
         doubts.append(
             f"the cine's RR interval is {1000 * rr_s:.0f} ms, that of {job.study.ecg.mr} "
-            f"{1000 * beats.median_s:.0f} ms: either timing is wrong, or the ECG is of another "
+            f"{1000 * beat_s:.0f} ms: either timing is wrong, or the ECG is of another "
             "examination or patient"
         )
     return doubts

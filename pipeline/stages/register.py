@@ -23,7 +23,7 @@ from pipeline.products import (
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import Registration, register, require_frames
-from pipeline.registration.time import detect_r_peaks, phases_at, summarise_rr
+from pipeline.registration.time import detect_r_peaks, median_rr_s, phases_at
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on how a study's folder is understood.
@@ -40,7 +40,7 @@ def run(job: Job) -> dict[str, Any]:
     r_times_s = _r_times_s(job.study, ecg)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
-    timing = _timing(job.study, sweeps, r_times_s, cycle.get("rr_s"))
+    timing = _timing(job.study, sweeps, r_times_s, cycle["rr_s"])
     found = _registered(job, sweeps, timing, surfaces, start)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found), sweeps[0].pose_frame)
@@ -56,7 +56,7 @@ def run(job: Job) -> dict[str, Any]:
         "chance_under_2_mm": round(found.chance_under_2_mm, 3),
         "breath_range_mm": round(float(np.ptp(found.breath_mm)), 2),
         "calibration": "; ".join(one.words() for one in found.corrections),
-        "median_rr_s": round(summarise_rr(r_times_s).median_s, 4),
+        "median_rr_s": round(median_rr_s(r_times_s), 4),
         **_clock_figures(found),
         "remarks": [*remarks_on(sweeps), *_doubts_of_patient(job, ecg)],
     }

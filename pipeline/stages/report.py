@@ -36,9 +36,9 @@ def run(job: Job) -> dict[str, Any]:
     # Pictures show two phases; a long cine of many slices need not stay in memory.
     del cine
     surfaces = read_surfaces(job.products / "surface", phases)
-    confidence, low = _confidence(job)
+    confidence = _confidence(job)
     sections = [
-        heart.segmentation(shown, confidence, low),
+        heart.segmentation(shown, confidence, LOW_CONFIDENCE),
         heart.movement(surfaces, rr_s, phases, measures),
         *_registration(job, surfaces),
         _field(job, shown),
@@ -48,7 +48,7 @@ def run(job: Job) -> dict[str, Any]:
         job.study.patient_id,
         _summary(job, measures, confidence),
         sections,
-        _example(job),
+        job.figures("bake")["example"],
         _notes(job),
     )
     (job.folder / "index.html").write_text(page, encoding="utf-8", errors="backslashreplace")
@@ -70,11 +70,10 @@ def _moments(job: Job, cine: Cine, numbers: tuple[int, int]) -> Moments:
     )
 
 
-def _confidence(job: Job) -> tuple[Float, float]:
-    """Confidence ``(phase, slice)``, NaN where it was not judged, and what counts as low."""
+def _confidence(job: Job) -> Float:
+    """Confidence of each image, ``(phase, slice)``."""
     said = read_table(job.products / "segment" / "confidence.json")
-    low = float(said.get("low_below", LOW_CONFIDENCE))
-    return np.array(said["confidence"], dtype=float), low
+    return np.array(said["confidence"], dtype=float)
 
 
 def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tuple[str, str]]:
@@ -267,8 +266,3 @@ def _against_truth(name: str, one: dict[str, Any]) -> list[str]:
         f"{motion['normal_mean']:.2f}" if motion else "-",
         f"{motion['tangential_mean']:.2f}" if motion else "-",
     ]
-
-
-def _example(job: Job) -> dict[str, Any]:
-    example: dict[str, Any] = job.figures("bake")["example"]
-    return example

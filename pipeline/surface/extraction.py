@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.errors import InputError, StageError
-from pipeline.geometry import Float, Integer, Label, MovingSurface, transform_points
+from pipeline.geometry import Float, Integer, Label, MovingSurface, nearest_phase, transform_points
 from pipeline.imaging.labels import LABELS
+from pipeline.progress import Progress
 from pipeline.surface.bodies import FEWEST_VOXELS, Body, cut_out, joined
 from pipeline.surface.correspondence import (
     Across,
@@ -42,7 +43,6 @@ GROWN_ON = dict.fromkeys(("left_atrium", "right_atrium", "aorta"), ("epicardium"
 
 REQUIRED_STRUCTURES = ("lv_endocardium", "epicardium")
 
-Progress = Callable[[int, int], None]
 # Tries at a mesh that passes through itself.
 UNCROSSINGS = 4
 # The interpreter lock leaves nothing for more.
@@ -214,7 +214,7 @@ def _require_seen(label_counts: Integer, name: str) -> None:
 
 def _carried(body: Body, phases: Float, settings: SurfaceSettings) -> _Followed:
     """One structure's surface through the beat by its own shape."""
-    reference = _reference(phases, settings)
+    reference = nearest_phase(phases, settings.reference_phase)
     template = extract_surface(body.levels[reference], settings.edge_mm)
     path = carry_through_cycle(template, body.levels, reference, phases)
     return _Followed(body, MovingSurface(path, template.triangles, phases))
@@ -226,7 +226,7 @@ def _drawn(
     """The same, sliding with the structures that it has grown on."""
     if not grown_on:
         return one
-    reference, moving = _reference(phases, settings), one.moving
+    reference, moving = nearest_phase(phases, settings.reference_phase), one.moving
     beside_mm = _vertices_in(one.body, grown_on)
     path = drawn_along(
         moving.at(reference), one.body.levels, moving.vertices_mm, reference, beside_mm
@@ -249,7 +249,7 @@ def _follow_heart(
 ) -> _Followed:
     """The outer surface of all parts, which goes where they go."""
     body = joined([part.body for part in parts], settings.heart_blend_mm, phases, across)
-    reference = _reference(phases, settings)
+    reference = nearest_phase(phases, settings.reference_phase)
     within_mm = _vertices_in(body, parts)
     template = extract_surface(body.levels[reference], settings.edge_mm)
     path = carry_along(template, body.levels, reference, phases, within_mm, across)
@@ -257,18 +257,12 @@ def _follow_heart(
     return _finished(carried, phases, settings, across)
 
 
-def _reference(phases: Float, settings: SurfaceSettings) -> int:
-    """Number of the phase that is nearest to the reference, cyclically."""
-    late = np.abs((phases - settings.reference_phase + 0.5) % 1.0 - 0.5)
-    return int(late.argmin())
-
-
 def _finished(
     one: _Followed, phases: Float, settings: SurfaceSettings, across: Across
 ) -> _Followed:
     """Smooth in time, sound in every phase, and of the volume of the labels."""
     body, triangles = one.body, one.moving.triangles
-    unfolder = make_unfolder(one.moving.at(_reference(phases, settings)))
+    unfolder = make_unfolder(one.moving.at(nearest_phase(phases, settings.reference_phase)))
     unfolded = [unfolder.mended(vertices, bad_triangles) for vertices in one.moving.vertices_mm]
     path_mm = smooth_in_time(np.stack(unfolded), phases, settings.temporal_smoothing_beats)
 

@@ -105,14 +105,6 @@ def vertex_areas(vertices_mm: Float, triangles: Integer) -> Float:
     return np.asarray(corner_normals(vertices_mm, triangles)[1] / 6)
 
 
-def triangle_quality(vertices_mm: Float, triangles: Integer) -> Float:
-    """4 sqrt(3) area over the sum of squared edges ``(m,)``: 1 if equilateral, 0 if a line."""
-    a, b, c = (vertices_mm[triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    squares = sum(np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c))
-    return np.asarray(4 * np.sqrt(3) * area / np.maximum(squares, np.finfo(float).tiny))
-
-
 def untangled(vertices_mm: Float, triangles: Integer, level: LevelSet) -> Float:
     """Vertices ``(n, 3)`` whose triangles are neither slivers nor folded over, as far as it goes.
 
