@@ -54,7 +54,9 @@ STAGES = (
     Stage("ingest", inputs=("cine", "mr_ecg")),
     Stage("segment", after=("ingest",), settings=("segment",)),
     Stage("surface", after=("ingest", "segment"), settings=("surface",)),
-    Stage("register", after=("ingest", "surface"), inputs=("us",), settings=("register",)),
+    Stage(
+        "register", after=("ingest", "segment", "surface"), inputs=("us",), settings=("register",)
+    ),
     Stage("bake", after=("ingest", "surface", "register"), settings=("bake", "fixtures")),
     Stage(
         "evaluate",

@@ -49,6 +49,16 @@ def recording():
     return record(seed=1)
 
 
+def a_job(settings, mirror_image=False):
+    """What the stage is given of a study whose images are, or are not, mirrored."""
+    return SimpleNamespace(
+        settings=SimpleNamespace(register_=settings),
+        products=Path(),
+        progress=None,
+        figures={"segment": {"mirror_image": mirror_image}}.get,
+    )
+
+
 class TestRegister:
     @pytest.mark.parametrize("seed", [0, 1, 2])
     def test_pose_is_found_from_15_mm_and_15_degrees_away(self, surfaces, recording, seed):
@@ -239,9 +249,7 @@ class TestRefusals:
         monkeypatch.setattr(stage, "register", failing)
         monkeypatch.setattr(stage, "read_cine", lambda _: None)
         settings = RegisterSettings(on_failure=on_failure)
-        job = SimpleNamespace(
-            settings=SimpleNamespace(register_=settings), products=Path(), progress=None
-        )
+        job = a_job(settings)
         timing = SimpleNamespace(phases=lambda: recording.phases)
         near = np.tile(np.eye(4), (14, 1, 1))
         near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
@@ -256,6 +264,23 @@ class TestRefusals:
         with pytest.raises(type(wrong) if stop else Skipped) as told:
             stage._registered(job, sweeps, timing, {}, None)
         assert "metres" not in str(told.value)
+
+    @pytest.mark.parametrize("mirror_image", [False, True])
+    def test_frames_of_mirrored_images_are_never_good(self, monkeypatch, recording, mirror_image):
+        def found(*given):
+            return given[-1]
+
+        monkeypatch.setattr(stage, "register", found)
+        monkeypatch.setattr(stage, "read_cine", lambda _: None)
+        timing = SimpleNamespace(phases=lambda: recording.phases)
+        job = a_job(RegisterSettings(), mirror_image)
+        told = stage._registered(job, [], timing, {}, None)
+        assert bool(told) == mirror_image
+        start = start_off(recording, 100, 8, 8)
+        given = recording.sweeps, recording.phases, moving_surfaces(), start
+        result = register(*given, QUICK, doubts=told)
+        assert (result.verdict == "good") != mirror_image
+        assert ("a mirror image" in result.reason) == mirror_image
 
     def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
         sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))

@@ -69,6 +69,12 @@ class Orientation:
         """Whether the file's directions are right."""
         return self == AS_THE_FILE_SAYS
 
+    @property
+    def is_mirror_image(self) -> bool:
+        """Whether the images are a mirror image of what the file says: two mirrorings are a turn,
+        which a tracker's pose undoes; one is undone by none."""
+        return self.mirrored != self.upside_down
+
     def applied(self, axes: Float) -> Float:
         """Axes of the view, ``(3, 3)`` rows, that the file's canonical ones become."""
         columns, rows, towards_base = axes
@@ -85,9 +91,8 @@ class Orientation:
             "mirrored in the plane" if self.mirrored else "",
             "base and apex exchanged" if self.upside_down else "",
         ]
-        # Two mirrorings are a turn, which a tracker's pose undoes; one is undone by none.
-        image = self.mirrored != self.upside_down
-        parts.append("a mirror image, to which no tracker's pose fits" if image else "")
+        mirror = "a mirror image, to which no tracker's pose fits"
+        parts.append(mirror if self.is_mirror_image else "")
         return "other than the file says: " + ", ".join(part for part in parts if part)
 
 

@@ -140,6 +140,7 @@ def register(
     progress: Progress | None = None,
     timing: Timing | None = None,
     cine: Cine | None = None,
+    doubts: Sequence[str] = (),
 ) -> Registration:
     """Find ``mr_from_tracker`` from tracked frames, their phases and the moving surfaces.
 
@@ -158,6 +159,8 @@ def register(
     cine
         What the surfaces were found in, of the same phases: it shows the muscle inside the
         ventricles that their smooth surfaces count to the blood. None: that is not looked at.
+    doubts
+        What is known to speak against any result: none is good then.
 
     Raises
     ------
@@ -169,6 +172,10 @@ def register(
     """
     settings = settings or RegisterSettings()
     found = find(sweeps, phases, surfaces, start, settings, progress, timing, cine)
+    if doubts:
+        verdict: Grade = "failed" if found.verdict == "failed" else "doubtful"
+        reasons = filter(None, [*doubts, found.reason])
+        found = replace(found, verdict=verdict, reason="; ".join(reasons))
     if found.verdict == "failed":
         raise StageError(found.reason)
     if found.verdict == "doubtful" and settings.accept == "good":

@@ -94,9 +94,10 @@ def _registered(
 ) -> Registration:
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
-    cine = read_cine(job.products / "ingest")
+    cine, doubts = read_cine(job.products / "ingest"), _doubts_of_images(job)
+    known = start, settings, job.progress, timing, cine, doubts
     try:
-        return register(sweeps, phases, surfaces, start, settings, job.progress, timing, cine)
+        return register(sweeps, phases, surfaces, *known)
     except (InputError, StageError) as error:
         odd = odd_transforms(sweeps)
         said = type(error)(f"{error}; {odd}") if odd else error
@@ -127,6 +128,15 @@ def _ecg(study: Study) -> Ecg:
 def _doubts_of_patient(job: Job, ecg: Ecg) -> list[str]:
     assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
     return other_patient(ecg, job.figures("ingest")["patient_mark"], job.study.ecg.us)
+
+
+def _doubts_of_images(job: Job) -> list[str]:
+    if not job.figures("segment")["mirror_image"]:
+        return []
+    return [
+        "the MR's images are a mirror image of what their header says, to which no tracker's pose "
+        "fits: look at the order of the slices and the orientation in the file"
+    ]
 
 
 def _r_times_s(study: Study, ecg: Ecg) -> Float:

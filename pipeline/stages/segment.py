@@ -35,5 +35,6 @@ def run(job: Job) -> dict[str, Any]:
         "least_certain": {"phase": int(lowest[0]), "slice": int(lowest[1])},
         "cut_off": cut_off(found.labels),
         "orientation": str(found.orientation),
+        "mirror_image": found.orientation.is_mirror_image,
         "volumes_ml": volumes,
     }
