@@ -1,5 +1,6 @@
 """The force servers of docs/examples: an ECG, or its R peaks, in; the field's forces out."""
 
+import re
 import runpy
 import shutil
 import subprocess
@@ -12,8 +13,13 @@ from field_baked import FIXTURES, PHASES, RADII_MM, bake_small
 
 from data_synth.ecg import EcgSettings, LostLead, phase_at, simulate_ecg, write_wfdb
 from pipeline.cli import main
+from pipeline.field import ForceField
+from pipeline.field.passivity import EnergyTank
+from pipeline.registration.clock import PhaseClock
 
-EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+DOCS = Path(__file__).parents[1] / "docs"
+EXAMPLES = DOCS / "examples"
+SERVER_C = EXAMPLES / "server.c"
 TIP_MM = (0.0, 25.0, 0.0)
 GUIDE = FIXTURES["guide"]
 
@@ -190,3 +196,58 @@ def test_times_are_those_of_the_recordings_own_clock(tmp_path, path, capsys):
     off = late[:, 1] - phase_at(late[:, 0] - 1000, ecg.r_times_s)
     assert len(late) > 5000
     assert np.percentile(np.abs(off - np.round(off)), 90) < 0.04
+
+
+LOOP = """
+int main(int count, char **words)
+{
+    bf_field field;
+    bf_clock clock = bf_new_clock(0.8, 5);
+    bf_tank tank = bf_full_tank(5, 20);
+    long turn;
+    if (count < 2 || bf_open(&field, words[1]) != BF_OK) return 1;
+    field.fixture[0].device_force_n = 1.2;
+    for (turn = 0; turn < 8000; turn++) {
+        double force_n[3], tip_mm[3] = {20, 0, -7};
+        tip_mm[0] += 6 * sin(0.01 * (double)turn) + (turn > 7000 ? 200 : 0);
+        if (turn % 800 == 130) bf_beat(&clock, 0.001 * (double)(turn - 130), 0);
+        one_turn(&field, 0, &clock, &tank, 0.001 * (double)turn, 1, tip_mm, force_n);
+        fwrite(force_n, sizeof(double), 3, stdout);
+    }
+    bf_close(&field);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "g++"])
+def test_the_pages_turn_of_a_loop_is_what_python_does(tmp_path, path, compiler):
+    """Tracker, clock, fade, the device's limit, tank; at last the tip leaves the grid."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}")
+    page = (DOCS / "field.md").read_text()
+    [turn] = [part for part in re.findall("```c\n(.*?)```", page, re.DOTALL) if "one_turn" in part]
+    headers = re.findall("#(?:define|include) .*BEATFIELD.*|#include .*", SERVER_C.read_text())
+    (tmp_path / "loop.c").write_text("\n".join([*headers, turn, LOOP]))
+    build(tmp_path / "loop.c", tmp_path / "loop", compiler=compiler)
+    done = subprocess.run([tmp_path / "loop", path], capture_output=True, check=True)
+    field, tank = ForceField.open(path), EnergyTank(5, 20)
+    # A full force fades within 0.2 s.
+    clock = PhaseClock(0.8, f_max_n=2.0, force_rate_n_per_s=10.0)
+    mr_from_tracker, expected = field.mr_from_tracker, []
+    for number in range(8000):
+        x_mm = 20 + 6 * np.sin(0.01 * number) + (200 if number > 7000 else 0)
+        point_mm = (mr_from_tracker @ (x_mm, 0, -7, 1))[:3]
+        if number % 800 == 130:
+            clock.beat(0.001 * (number - 130))
+        outside = not field.contains([point_mm])[0]
+        tick = clock.at(0.001 * number, withheld=outside)
+        force_n = tick.fade * np.array(field.force_at(*point_mm, tick.phase, "guide"))
+        force_n *= min(1.0, 1.2 / max(np.linalg.norm(force_n), 1e-9))
+        passed_n = np.array(tank.passed(point_mm, force_n))
+        expected.append(passed_n @ mr_from_tracker[:3, :3])
+    found = np.frombuffer(done.stdout).reshape(-1, 3)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    size_n = np.linalg.norm(found, axis=1)
+    assert size_n[:1000].max() == 0 < 1.19 < size_n.max() < 1.2 + 1e-9
+    assert size_n[-300:].max() == 0
