@@ -14,7 +14,7 @@ import pytest
 
 from pipeline import caches, compiled
 from pipeline.batch_table import outcome_of, write_table
-from pipeline.console import plain, show
+from pipeline.console import BatchConsole, plain, show
 from pipeline.ending import guarded
 from pipeline.errors import InputError
 from pipeline.publish import locked
@@ -85,6 +85,21 @@ def test_a_folders_name_commands_no_terminal(tmp_path: Path) -> None:
     assert ended.returncode == 2
     assert "s\\x1b]0;mine\\x07\\x1b[2J\\u202e: its name is no" in ended.stderr
     assert plain("two\n\tlines: 5 µm") == "two\n\tlines: 5 µm"
+
+
+def test_a_batch_says_how_long_it_will_take(
+    monkeypatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = iter((0.0, 120.0, 480.0, 500.0))
+    monkeypatch.setattr("pipeline.console.time.monotonic", lambda: next(now_s))
+    told = BatchConsole()
+    outcome = outcome_of("anna", "done", "", "p-1", Path("/studies/anna")).outcome
+    for done in (1, 4, 5):
+        told.ended(outcome, done, 5)
+    one, four, five = capsys.readouterr().err.splitlines()
+    assert one.endswith("s, about 8 min to go")
+    assert four.endswith("s, about 2 min to go")
+    assert "to go" not in five
 
 
 def test_a_terminal_of_few_letters_is_shown_the_others_numbers(tmp_path: Path) -> None:
