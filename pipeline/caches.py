@@ -23,7 +23,7 @@ def provide_place() -> None:
     InputError
         When not even temporary files may be written.
     """
-    if PLACE in os.environ or os.access(Path(__file__).parent, os.W_OK):
+    if os.environ.get(PLACE) or os.access(Path(__file__).parent, os.W_OK):
         return
     own = own_caches()
     if own is None or not is_writable(own):

@@ -10,6 +10,7 @@ import json
 import signal
 import subprocess
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +19,7 @@ from cyclopts import App, Parameter
 
 from pipeline import __version__
 from pipeline.caches import provide_place
-from pipeline.console import BatchConsole, Console, show, tell
+from pipeline.console import BatchConsole, Console, show, tell, warning_line
 from pipeline.ending import guarded
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
@@ -367,6 +368,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Who starts it with `nohup` wants it to outlive the terminal.
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
+
+    warnings.formatwarning = warning_line
 
     def command() -> Any:
         provide_place()

@@ -33,19 +33,19 @@ class Console:
         """A stage begins."""
         self._stage = stage
         self._last_s = time.monotonic()
-        say(f"{stage:9s} ...")
+        _line(f"{stage:9s} ...")
 
     def progress(self, done: int, total: int) -> None:
         """Say how far the stage is, at most every two seconds."""
         now_s = time.monotonic()
         if now_s - self._last_s >= self.QUIET_S:
             self._last_s = now_s
-            say(f"{self._stage:9s} {done}/{total}")
+            _line(f"{self._stage:9s} {done}/{total}")
 
     def ended(self, stage: str, outcome: str, seconds: float) -> None:
         """A stage ended."""
         took = f" in {seconds:.1f} s" if seconds else ""
-        say(f"{stage:9s} {outcome}{took}")
+        _line(f"{stage:9s} {outcome}{took}")
 
 
 class BatchConsole:
@@ -66,6 +66,12 @@ class BatchConsole:
     def interrupted(self, running: int) -> None:
         """No other study begins."""
         say(f"interrupted; waiting for {running} to end, Ctrl-C again ends them at once")
+
+
+def _line(text: str) -> None:
+    """Print on standard error, unless who called closed it."""
+    if sys.stderr is not None:
+        print(plain(text), file=sys.stderr, flush=True)
 
 
 def say(text: str) -> None:
@@ -97,6 +103,11 @@ def plain(text: str) -> str:
     a\\x1b[2Jb
     """
     return _COMMANDS.sub(lambda one: ascii(one[0])[1:-1], text)
+
+
+def warning_line(message: Warning | str, *_: object, **__: object) -> str:
+    """A library's warning as one that may be shown: some tell what a file holds."""
+    return plain(f"warning: {message}\n")
 
 
 def silence(*streams: TextIO | None) -> None:

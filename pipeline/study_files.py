@@ -17,7 +17,7 @@ LITTER = ("thumbs.db", "desktop.ini")
 
 # A MetaImage header is text; pixels may follow in the same file.
 _HEADER_BYTES = 1 << 24
-_DATA_FILE = re.compile(rb"^[ \t]*ElementDataFile[ \t]*[=:][ \t]*(.*?)[ \t\r]*$", re.MULTILINE)
+_DATA_FILE = re.compile(rb"^[^\S\n]*ElementDataFile[ \t]*[=:](.*)$", re.MULTILINE)
 
 
 def files_below(path: Path) -> list[Path]:
@@ -140,13 +140,16 @@ def sweep_files(sweep: Path) -> list[Path]:
     """
     try:
         with sweep.open("rb") as file:
-            named = _DATA_FILE.search(file.read(_HEADER_BYTES))
+            header = file.read(_HEADER_BYTES)
     except OSError as error:
         raise InputError(f"{sweep}: cannot be read ({error})") from error
-    name = named[1].decode(errors="replace") if named else "LOCAL"
+    named = _DATA_FILE.search(header)
+    name = named[1].decode(errors="replace").strip() if named else "LOCAL"
     if name.upper() == "LOCAL":
         return [sweep]
-    _require_beside(sweep, name)
+    listed = header[named.end() :] if named and name.startswith("LIST") else b""
+    for one in (name, *listed.decode(errors="replace").splitlines()):
+        _require_beside(sweep, one.strip())
     if _is_file(sweep.parent / name):
         return [sweep, sweep.parent / name]
     others = (one for one in _in_folder(sweep.parent) if one.suffix.lower() not in (".mha", ".mhd"))

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline import caches, compiled
 from pipeline.batch_table import outcome_of, write_table
-from pipeline.console import BatchConsole, plain, show
+from pipeline.console import BatchConsole, Console, plain, show
 from pipeline.ending import guarded
 from pipeline.errors import InputError
 from pipeline.publish import locked
@@ -57,6 +57,30 @@ def test_where_nothing_may_be_written_it_is_said_what_to_give(tmp_path, monkeypa
     caches.place_of_this_run.cache_clear()
     with pytest.raises(InputError, match=r"kept nowhere .*XDG_CACHE_HOME or TMPDIR"):
         compiled._place.__wrapped__(a_package_that_may_not_be_written(tmp_path))
+
+
+@pytest.mark.parametrize("given", [None, ""])
+@pytest.mark.parametrize("home", [None, "a file", "home"])
+def test_a_compiler_that_would_find_no_place_is_given_one(tmp_path, monkeypatch, given, home):
+    monkeypatch.setenv(caches.PLACE, "")
+    if given is None:
+        monkeypatch.delenv(caches.PLACE)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setattr(Path, "home", nowhere if home is None else lambda: tmp_path / home)
+    caches.place_of_this_run.cache_clear()
+    caches.provide_place()
+    assert not os.environ.get(caches.PLACE)
+    monkeypatch.setattr("os.access", lambda *_: False)
+    caches.provide_place()
+    place = os.environ.get(caches.PLACE)
+    caches.place_of_this_run.cache_clear()
+    assert bool(place) == (home != "home")
+    assert not place or Path(place).parent == tmp_path
+    monkeypatch.setenv(caches.PLACE, "the user's own")
+    caches.provide_place()
+    assert os.environ[caches.PLACE] == "the user's own"
 
 
 @pytest.mark.parametrize(("ends", "code"), [(">&-", 0), ("<&- >&- 2>&-", 0), ("> /dev/full", 2)])
@@ -102,12 +126,32 @@ def test_a_batch_says_how_long_it_will_take(
     assert "to go" not in five
 
 
+def test_what_a_library_warns_of_commands_no_terminal() -> None:
+    """As DICOM files do that name a character set which nobody knows."""
+    program = (
+        "import warnings; from pipeline.cli import main; main(['--version']); "
+        "warnings.warn('Unknown encoding \x1b[2J')"
+    )
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.stderr == "warning: Unknown encoding \\x1b[2J\n"
+
+
+def test_how_a_run_goes_commands_no_terminal_and_goes_to_no_other_stream(monkeypatch, capsys):
+    console = Console()
+    console.ended("register", "skipped: \x1b[2J", 0.0)
+    assert capsys.readouterr().err == "register  skipped: \\x1b[2J\n"
+    monkeypatch.setattr(sys, "stderr", None)
+    console.started("bake")
+    assert capsys.readouterr().out == ""
+
+
 def test_a_terminal_of_few_letters_is_shown_the_others_numbers(tmp_path: Path) -> None:
-    program = f"from pipeline.console import {show.__name__}; show('\xe9')"
+    program = f"from pipeline.console import {show.__name__}; show('\xe9\\x1b')"
     plainest = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, cwd=ROOT, env=plainest, capture_output=True, check=False)
-    assert ended.stdout == b"\\xe9\n"
+    assert ended.stdout == b"\\xe9\\x1b\n"
 
 
 def test_files_are_read_and_written_alike_whatever_letters_the_system_knows(tmp_path: Path) -> None:

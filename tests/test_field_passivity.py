@@ -107,3 +107,33 @@ def test_no_swing_gives_more_than_the_tank_held(swing_mm, rate_hz, level_mj):
 def test_impossible_tanks_are_refused(level, capacity):
     with pytest.raises(InputError, match="needs 0 <= level_mj <= capacity_mj"):
         EnergyTank(level, capacity)
+
+
+def along(tank, way_mm: float, ticks: int):
+    """Shares of 1 N that are rendered on a way too short to change the level."""
+    start = tank._point_mm[0] if tank._point_mm else 0.0
+    places = start + way_mm * np.arange(1, ticks + 1)
+    return np.array([tank.passed((x, 0.0, 0.0), (1.0, 0.0, 0.0))[0] for x in places])
+
+
+def test_a_low_tank_lessens_what_drives_by_its_level_and_what_brakes_not_at_all():
+    tank = EnergyTank(1.0, 20.0)
+    tank.passed((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    # Half of a tenth of the capacity.
+    going = along(tank, 1e-9, 30)
+    np.testing.assert_allclose(going[:10], 1 - 0.05 * np.arange(1, 11))
+    np.testing.assert_allclose(going[10:], 0.5, atol=1e-6)
+    # Where the tool rests, what it did last stands.
+    np.testing.assert_allclose(along(tank, 0.0, 5), 0.5, atol=1e-6)
+    np.testing.assert_allclose(along(tank, -1e-9, 5), 0.5 + 0.005 * np.arange(1, 6), atol=1e-6)
+    np.testing.assert_allclose(along(tank, -1e-9, 200)[-1], 1.0)
+    np.testing.assert_array_equal(along(EnergyTank(2.1, 20.0), 1e-9, 30), 1.0)
+
+
+def test_in_debt_a_tool_at_rest_feels_only_what_brakes():
+    tank = EnergyTank(0.0, 20.0)
+    along(tank, 0.01, 2)
+    assert tank.level_mj < 0
+    assert along(tank, 0.0, 1) == 0
+    assert along(tank, -1e-9, 1) > 0
+    assert along(tank, 0.0, 1) > 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import subprocess
+import time
 from pathlib import Path
 
 import nibabel
@@ -17,9 +18,11 @@ from pipeline.errors import InputError
 from pipeline.field import ForceField, get_include
 from pipeline.field.verify import verify_field
 from pipeline.imaging.ecg import patient_mark, read_ecg
+from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.ultrasound import read_sweep
 from pipeline.study import open_study
+from pipeline.study_files import sweep_files
 from pipeline.yaml_files import read_yaml
 
 
@@ -164,9 +167,65 @@ def test_headers_do_not_have_files_of_other_folders_read(tmp_path: Path, name: s
         open_study(folder).input_digests()
 
 
+def test_what_memory_holds_is_read() -> None:
+    require_bounded(1 << 30, "a.nii")
+    with pytest.raises(InputError, match=r"a\.nii: its header tells of 1\.07e\+09 values"):
+        require_bounded((1 << 30) + 1, "a.nii")
+
+
 def test_what_tells_patients_apart_does_not_tell_who_they_are() -> None:
     """Who tries all numbers of a hospital finds as many patients as would fit as not."""
     numbers = [f"{number:07d}" for number in range(40_000)]
     fitting = [one for one in numbers if patient_mark(one) == patient_mark("0012345")]
     assert len(fitting) > 3
     assert len(fitting) < 100
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("DimSize", "1.7e4 12000 5000", "tells no DimSize in whole numbers"),
+        ("ElementType", "MET_LONG", r"tells of 1.02e.12 values"),
+    ],
+)
+def test_a_sweep_whose_size_is_written_otherwise_is_measured_all_the_same(
+    tmp_path: Path, key: str, value: str, said: str
+) -> None:
+    """The library reads powers of ten, and kinds of values of which no scanner has any."""
+    path = write(tmp_path / "sweep.mha", good_fields())
+    header, pixels = path.read_bytes().split(b"ElementDataFile", 1)
+    lines = dict(line.split(" = ", 1) for line in header.decode().splitlines())
+    lines |= {"DimSize": "17000 12000 5000", key: value}
+    header = "".join(f"{name} = {text}\n" for name, text in lines.items()).encode()
+    path.write_bytes(header + b"ElementDataFile" + pixels)
+    with pytest.raises(InputError, match=said):
+        read_sweep(path)
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        "ElementDataFile = LIST 2D\na.raw\n../patient/other.raw\n",
+        "\vElementDataFile = ../other.raw\n",
+    ],
+    ids=["list", "tab"],
+)
+def test_no_spelling_has_a_sweep_read_files_of_other_folders(tmp_path: Path, end: str) -> None:
+    folder = a_study(tmp_path)
+    for name in ("ecg", "us"):
+        (folder / name).mkdir()
+    (folder / "us" / "a.mhd").write_text(f"ObjectType = Image\n{end}")
+    (folder / "us" / "a.raw").write_bytes(bytes(9))
+    (folder / "ecg" / "us.csv").write_text("time_s,II\n")
+    with pytest.raises(
+        InputError, match=r"a\.mhd: names \.\./.*other\.raw, which is not beside it"
+    ):
+        open_study(folder).input_digests()
+
+
+def test_a_header_of_blanks_takes_no_longer_than_it_is_long(tmp_path: Path) -> None:
+    path = tmp_path / "a.mhd"
+    path.write_bytes(b"\n" * 200_000 + b"ElementDataFile = a" + b" " * 200_000 + b"b\n")
+    begun_s = time.process_time()
+    assert sweep_files(path) == [path]
+    assert time.process_time() - begun_s < 5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi
 
+from pipeline.errors import StageError
 from pipeline.geometry import transform_points
 from pipeline.registration import space
 from pipeline.registration.frames import Samples
@@ -263,3 +265,23 @@ class TestVerdict:
             RegisterSettings(good_tre_mm=3, worst_tre_mm=2)
         with pytest.raises(ValueError, match=r"(?s)seed.*greater than or equal to 0"):
             RegisterSettings(seed=-1)
+
+
+@pytest.mark.parametrize("verdict", ["good", "doubtful", "failed"])
+def test_doubts_are_told_before_other_reasons_and_mend_no_failure(monkeypatch, verdict):
+    reason = "" if verdict == "good" else "far"
+    monkeypatch.setattr(space, "find", lambda *_: Result(verdict, reason))
+    if verdict == "failed":
+        with pytest.raises(StageError, match=r"^mirrored; far$"):
+            space.register([], [], {}, None, doubts=["mirrored"])
+        return
+    found = space.register([], [], {}, None, doubts=["mirrored"])
+    assert found == Result("doubtful", "; ".join(filter(None, ["mirrored", reason])))
+
+
+@dataclass
+class Result:
+    """What `register` looks at of a registration."""
+
+    verdict: str
+    reason: str

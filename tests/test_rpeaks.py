@@ -8,7 +8,13 @@ import pytest
 from data_synth.ecg import EcgSettings, LostLead, simulate_ecg
 from pipeline.errors import InputError
 from pipeline.registration.rhythm import doubt, read_rhythm
-from pipeline.registration.rpeaks import LATENCY_S, LEARN_S, RPeakDetector, find_beats
+from pipeline.registration.rpeaks import (
+    LATENCY_S,
+    LEARN_S,
+    RPeakDetector,
+    _is_strange,
+    find_beats,
+)
 
 # AAMI EC57 matches a detection to a beat within 150 ms.
 SAME_BEAT_S = 0.15
@@ -174,6 +180,27 @@ def test_ventricular_beats_look_strange_and_others_hardly_ever(noise):
     # One that begins as usual beats do may pass for one; a usual one misjudged costs trust for two.
     assert np.mean(told["premature_ventricular"]) > 0.5
     assert np.mean(told["normal"]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("likeness", "others", "strange"),
+    [
+        (0.76, [], False),
+        (0.74, [], True),
+        # Five beats tell no scatter.
+        (0.76, [0.99] * 5, False),
+        (0.92, [0.99] * 6, True),
+        (0.94, [0.99] * 6, False),
+        # A median absolute deviation of 0.04: three standard deviations are 0.178.
+        (0.78, [0.91, 0.95, 0.99] * 3, False),
+        (0.76, [0.91, 0.95, 0.99] * 3, True),
+        # However alike beats were, so little is another shape.
+        (0.74, [0.6, 0.8, 1.0] * 3, True),
+        (0.76, [0.6, 0.8, 1.0] * 3, False),
+    ],
+)
+def test_another_shape_is_told_by_the_scatter_of_the_beats_before(likeness, others, strange):
+    assert _is_strange(likeness, others) == strange
 
 
 def test_blocks_of_any_size_give_the_same_beats():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from sweep_files import calibration, text, write
 
+from pipeline.errors import InputError
 from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.ultrasound import Sweep, read_sweep, remarks_on
 
@@ -63,14 +64,29 @@ def test_a_tracker_that_was_stuck_and_leaps_is_left_out(rng):
 
 
 def test_where_a_recording_begins_stuck_no_frame_is_known_to_be_new(rng):
-    kept = without_stuck(recording(repeating(swept(rng), slice(0, 15))))
-    np.testing.assert_array_equal(kept.numbers, np.arange(15, COUNT))
+    kept = without_stuck(recording(repeating(swept(rng), slice(0, 30))))
+    np.testing.assert_array_equal(kept.numbers, np.arange(30, COUNT))
+    assert len(kept.remarks) == 1
+
+
+def test_one_leap_hides_no_other(rng):
+    poses = repeating(repeating(swept(rng), slice(10, 25)), slice(35, 50))
+    kept = without_stuck(recording(poses))
+    np.testing.assert_array_equal(kept.numbers, [*range(11), *range(25, 36), *range(50, COUNT)])
 
 
 def test_a_tracker_that_stays_stuck_is_told_of(rng):
     kept = without_stuck(recording(repeating(swept(rng), slice(30, COUNT))))
     assert len(kept.numbers) == COUNT
     assert "frames 30 to 59 (1.5 s) have one and the same pose" in kept.remarks[0]
+
+
+def test_a_pose_that_a_sweep_begins_with_and_leaves_slowly_is_told_of():
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, 1, 3] = np.cumsum(np.repeat([0.0, 2.5], [30, 30]))
+    kept = without_stuck(recording(poses))
+    assert len(kept.numbers) == COUNT
+    assert "frames 0 to 29 (1.5 s) have one and the same pose" in kept.remarks[0]
 
 
 def still(rng):
@@ -82,6 +98,18 @@ def encoders(rng):
     poses = np.tile(np.eye(4), (COUNT, 1, 1))
     poses[:, 1, 3] = np.cumsum(np.repeat([2.5, 0.0, 2.5], [12, 24, 24]))
     return poses
+
+
+def hasty_encoders(rng):
+    """The same, which begins to move at twice its speed."""
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, 1, 3] = np.cumsum(np.repeat([2.5, 0.0, 5.0, 2.5], [12, 24, 1, 23]))
+    return poses
+
+
+def stuck_at_last(rng):
+    """For 0.7 s, which may be the probe's rest."""
+    return repeating(swept(rng), slice(45, COUNT))
 
 
 def slow_encoders(rng):
@@ -99,7 +127,17 @@ def slow_tracker(rng):
 
 
 @pytest.mark.parametrize(
-    "poses", [still, encoders, slow_encoders, stuck_for_little, slow_tracker, swept]
+    "poses",
+    [
+        still,
+        encoders,
+        hasty_encoders,
+        slow_encoders,
+        stuck_for_little,
+        stuck_at_last,
+        slow_tracker,
+        swept,
+    ],
 )
 def test_arms_and_slow_trackers_are_in_order(rng, poses):
     sweep = recording(poses(rng))
@@ -116,8 +154,11 @@ def test_a_frozen_picture_of_a_probe_that_is_held_is_in_order(rng):
 
 def test_pictures_of_a_slow_scanner_and_flat_ones_are_in_order(rng):
     sweep = recording(swept(rng))
-    slow = sweep.images[np.arange(COUNT) // 4 * 4]
-    assert without_stuck(recording(sweep.tracker_from_probe, slow)).remarks == ()
+    for times in (4, 8):
+        slow = sweep.images[np.arange(COUNT) // times * times]
+        assert without_stuck(recording(sweep.tracker_from_probe, slow)).remarks == ()
+    hiccup = repeating(sweep.images, slice(20, 25))
+    assert without_stuck(recording(sweep.tracker_from_probe, hiccup)).remarks == ()
     flat = sweep.images.copy()
     flat[STUCK] = 0
     assert without_stuck(recording(sweep.tracker_from_probe, flat)).remarks == ()
@@ -140,3 +181,11 @@ def test_a_file_is_read_without_them(tmp_path, rng):
     sweep = read_sweep(write(tmp_path / "s.mha", fields, pixels))
     assert len(sweep.numbers) == COUNT - 14
     assert "s: 14 of 60 frames left out" in remarks_on([sweep])[0]
+
+
+def test_a_sweep_of_which_no_frame_is_left_is_refused(rng):
+    """Its pose is stuck until its display freezes for good."""
+    poses = repeating(swept(rng), slice(0, 21))
+    images = repeating(recording(poses).images, slice(15, COUNT))
+    with pytest.raises(InputError, match=r"^s: 60 of 60 frames left out: .*record the sweep"):
+        without_stuck(recording(poses, images))

@@ -32,11 +32,12 @@ class EnergyTank:
 
     Energy that the hand gives fills the tank, up to its capacity; energy that the hand gets drains
     it; where it is empty, the part of the force that would drive the motion on is withheld. So
-    the hand never gets more than the tank held at first, but for one tick's step that could not be
-    foreseen. Before it is empty a force that drives is lessened by degrees, all of it, as the
-    level falls, and comes back by degrees: else it would begin and end at every turn of the
-    motion. It counts what it passes, so that must be what the hand gets: fading and a device's
-    limit come before it. A torque is not counted. ``bf_pass`` of the C header is the same.
+    the hand never gets more than the tank held at first, but for one tick's step at a turn of the
+    motion, which could not be foreseen. Before it is empty a force that drives is lessened by
+    degrees, all of it, as the level falls, and comes back by degrees: else it would begin and end
+    at every turn of the motion. It counts what it passes, so that must be what the hand gets:
+    fading and a device's limit come before it. A torque is not counted. ``bf_pass`` of the C
+    header is the same.
 
     Raises
     ------

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Mask
 
 if TYPE_CHECKING:
@@ -45,6 +46,11 @@ def without_stuck(sweep: Sweep) -> Sweep:
     A picture that stands still while the probe moves is at its place in the first frame alone. A
     pose that stands still while pictures go on is one of a probe at rest (an arm with encoders
     gives it to the last bit) unless it leaps afterwards, faster than the probe ever moves.
+
+    Raises
+    ------
+    InputError
+        When no frame is left.
     """
     corners_mm = _corners_mm(sweep)
     pictures = list(_odd(_repeats(sweep.images), sweep.times_s))
@@ -62,6 +68,8 @@ def without_stuck(sweep: Sweep) -> Sweep:
         kept[run.first + (run.first > 0) : run.last + 1] = False
     if not kept.all():
         remarks.append(_told_left_out(kept, frozen, leaps))
+    if not kept.any():
+        raise InputError(f"{sweep.name}: {remarks[-1]}; record the sweep again")
     return replace(
         sweep,
         images=sweep.images[kept],

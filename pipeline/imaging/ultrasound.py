@@ -234,7 +234,11 @@ def _require_all_bytes(path: Path) -> None:
     The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
     """
     header, start = _header_of(path)
-    require_bounded(_pixel_bytes(header) or 0, str(path))
+    values, each = _values(header), _VALUE_BYTES.get(header.get("ElementType", ""))
+    if values is None:
+        raise InputError(f"{path}: its header tells no DimSize in whole numbers; {_COPY}")
+    require_bounded(values, str(path))
+    whole = values * each if each else None
     where = header.get(_HEADER_ENDS, "")
     if _SEVERAL_FILES.search(where):
         return
@@ -248,7 +252,7 @@ def _require_all_bytes(path: Path) -> None:
             f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
             "it again, or uncompressed"
         )
-    needed = _number(header.get("CompressedDataSize")) if packed else _pixel_bytes(header)
+    needed = _number(header.get("CompressedDataSize")) if packed else whole
     found = pixels.stat().st_size - (start if pixels == path else 0)
     if needed is not None and found < needed:
         raise InputError(
@@ -256,7 +260,7 @@ def _require_all_bytes(path: Path) -> None:
             f"{_COPY}"
         )
     if packed:
-        _require_unpacked(pixels, start if pixels == path else 0, _pixel_bytes(header))
+        _require_unpacked(pixels, start if pixels == path else 0, whole)
 
 
 def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
@@ -299,15 +303,10 @@ def _header_of(path: Path) -> tuple[Fields, int]:
         return header, file.tell()
 
 
-def _pixel_bytes(header: Fields) -> int | None:
-    """How many bytes all pixels take; None where the header does not say."""
-    sizes = [_number(word) for word in header.get("DimSize", "?").split()]
-    sizes += [
-        _number(header.get("ElementNumberOfChannels", "1")),
-        _VALUE_BYTES.get(header.get("ElementType", "")),
-    ]
-    known = [size for size in sizes if size is not None]
-    return math.prod(known) if len(known) == len(sizes) else None
+def _values(header: Fields) -> int | None:
+    """How many values all pixels have; None where the header does not say in whole numbers."""
+    words = [*header.get("DimSize", "?").split(), header.get("ElementNumberOfChannels", "1")]
+    return math.prod(_number(word) or 0 for word in words) or None
 
 
 def _number(word: str | None) -> int | None:
