@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from pipeline.imaging.cleanup import clean_cycle, clean_probability, ventricle_tip
+from pipeline.imaging.cleanup import (
+    _end_of_cavity,
+    clean_cycle,
+    clean_probability,
+    ventricle_tip,
+)
 
 SIDE, PIXEL_MM = 64, 1.5
 CAVITY, MUSCLE, RV, ATRIUM = 1, 2, 3, 4
@@ -246,6 +251,16 @@ def test_fat_that_is_ringed_beyond_the_tip_is_no_cavity():
     found = cleaned(heart)
     assert not (found[:2] == CAVITY).any()
     np.testing.assert_array_equal(found[2:], heart[2:])
+
+
+@pytest.mark.parametrize(("beyond", "end"), [((5,), 2), ((6, 9), 0)])
+def test_a_cavity_goes_on_beyond_a_bare_plane_where_rings_hold_a_quarter_as_much(beyond, end):
+    """Cuts go as the square of the radius: 25, or 36 and 81, of 64 + 81 + 121 + 144 = 410."""
+    bare = np.where(RADIUS < 10, CAVITY, 0)
+    heart = [*(ring(k, 14) for k in beyond), bare, *(ring(k, 18) for k in (8, 9, 11, 12))]
+    rings = np.array([(plane == MUSCLE).any() for plane in heart])
+    found = _end_of_cavity(np.stack(heart), rings, len(heart) - 1, 0, PIXEL_MM)
+    assert found == end
 
 
 def test_a_plane_without_half_of_its_wall_is_no_tip_and_is_held_within_its_neighbours():

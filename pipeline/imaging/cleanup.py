@@ -24,9 +24,6 @@ LEAP, LEAP_MM2 = 1.4, 90.0
 """A cut through the ventricle may be so much larger, and by so much, than that of the plane before
 it towards the tip: room for an aneurysm, which widens by degrees."""
 
-UPON = 0.5
-"""Share of a cavity's cut that lies upon another's where both are of one ventricle."""
-
 GOES_ON = 0.25
 """A cavity does not end where rings beyond hold so much of what those before hold: fat beyond the
 tip holds less."""
@@ -192,10 +189,9 @@ def _close_apex(part: Float32, tip: int, pixel_mm: float) -> None:
     # The widest ring: a thick wall of the right ventricle may be taken for more muscle than any.
     rings = np.array([_ringed(plane) > CLOSED_SHARE for plane in labels])
     rings[:tip] = False
-    shown = inside & _largest_chain(inside, rings)[:, None, None]
-    size = (shown if rings.any() else labels == MUSCLE).sum(axis=(1, 2))
+    size = (inside * rings[:, None, None] if rings.any() else labels == MUSCLE).sum(axis=(1, 2))
     widest = int(size.argmax())
-    end = _end_of_cavity(part, rings, widest, tip, pixel_mm)
+    end = _end_of_cavity(labels, rings, widest, tip, pixel_mm)
     for number in range(widest, -1, -1):
         # Nothing but muscle or background lies there: no other chamber reaches the tip.
         if number < end:
@@ -205,43 +201,24 @@ def _close_apex(part: Float32, tip: int, pixel_mm: float) -> None:
             part[number, MUSCLE] *= ~whole[number]
 
 
-def _largest_chain(inside: Mask, rings: Mask) -> Mask:
-    """Which planes are the rings, each upon the one before, whose cavities hold most; ``(plane,)``.
-
-    A bubble of gas, or the void about metal, shows as a ring of its own beside the ventricle.
-    """
-    chain = np.zeros(len(rings), int)
-    for below, above in pairwise(np.flatnonzero(rings)):
-        least = min(inside[below].sum(), inside[above].sum())
-        chain[above] = chain[below] + ((inside[below] & inside[above]).sum() < UPON * least)
-    held = np.bincount(chain, weights=rings * inside.sum(axis=(1, 2)))
-    return np.asarray(rings & (chain == held.argmax()))
-
-
-def _end_of_cavity(part: Float32, rings: Mask, widest: int, tip: int, pixel_mm: float) -> int:
+def _end_of_cavity(labels: Label, rings: Mask, widest: int, tip: int, pixel_mm: float) -> int:
     """The plane nearest the tip that holds the cavity; ``widest + 1`` where none does.
 
     A plane in which much of the wall or of the cavity was missed, as papillary muscles that fill
-    it or the void about metal make it, is no tip while rings go on beyond it: in place, its cavity
-    is held within the ventricle of the rings on both sides.
+    it or the void about metal make it, is no tip while rings go on beyond it.
     """
-    labels = most_probable(part)
-    inside, whole = labels == CAVITY, (labels == CAVITY) | (labels == MUSCLE)
-    cuts_mm2 = pixel_mm**2 * inside.sum(axis=(1, 2))
+    cuts_mm2 = pixel_mm**2 * (labels == CAVITY).sum(axis=(1, 2))
     end, number = widest + 1, widest
     while number >= tip:
-        last = min(end, widest)
-        border = labels[number][ndimage.binary_dilation(inside[number]) & ~inside[number]]
-        surrounded = inside[number].any() and (border == 0).mean() < OPEN_SHARE
+        last, inside = min(end, widest), labels[number] == CAVITY
+        border = labels[number][ndimage.binary_dilation(inside) & ~inside]
+        surrounded = inside.any() and (border == 0).mean() < OPEN_SHARE
         if surrounded and not _leaps(cuts_mm2[number], cuts_mm2[last]):
             end, number = number, number - 1
             continue
-        upon = pixel_mm**2 * (inside & whole[last]).sum(axis=(1, 2)) > UPON * cuts_mm2
-        leaps = np.array([_leaps(cut_mm2, cuts_mm2[last]) for cut_mm2 in cuts_mm2])
-        beyond = np.flatnonzero((rings & upon & ~leaps)[:number])
-        if cuts_mm2[beyond].sum() <= GOES_ON * (cuts_mm2 * rings)[last:].sum():
+        beyond = np.flatnonzero(rings[:number])
+        if cuts_mm2[beyond].sum() <= GOES_ON * cuts_mm2[last:].sum():
             break
-        part[beyond[-1] + 1 : number + 1, CAVITY] *= whole[last] | whole[beyond[-1]]
         number = int(beyond[-1])
     return end
 
