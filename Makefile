@@ -16,7 +16,7 @@ STUDIES ?= demo/studies-$(SEED)
 CONFIG ?= configs/default.yaml
 WORKERS ?= 2
 
-# Rules read them as "$$STUDY", for names may hold spaces and all else that a shell obeys.
+# Rules read them as "$$STUDY", for names may hold spaces and quotes; Make itself takes $$ for $.
 export STUDY OUT STUDIES CONFIG
 # A study of one's own is there, and Make knows no names with spaces.
 DEMO_STUDY := $(if $(filter-out $(DEMO),$(STUDY)),$(READY),$(DEMO)/study.yaml)
