@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import cv2
@@ -13,6 +14,9 @@ from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.auricle import join_auricle
 from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE, most_probable
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
+
+THREADS = 2
+"""The interpreter lock leaves nothing for more."""
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
@@ -59,8 +63,12 @@ def clean_cycle(value: Float32, pixel_mm: float) -> None:
         Distance between rows and between columns.
     """
     tip = ventricle_tip(value, pixel_mm)
-    for phase, probability in enumerate(value):
-        value[phase] = clean_probability(probability, pixel_mm, tip)
+
+    def clean(phase: int) -> None:
+        value[phase] = clean_probability(value[phase], pixel_mm, tip)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(clean, range(len(value))))
 
 
 def ventricle_tip(value: Float32, pixel_mm: float) -> int:
