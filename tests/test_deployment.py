@@ -193,6 +193,7 @@ def test_a_sweeps_name_is_no_formula() -> None:
         [np.zeros((4, 4))], ["a$\\frac{$, frame 3"], np.eye(4)[None], np.zeros(1), {}
     )
     figure.savefig(io.BytesIO())
+    assert figure.axes[0].get_title() == "a$\\frac{$, frame 3, phase 0.00"
 
 
 def made(*words: str) -> str:

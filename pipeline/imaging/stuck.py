@@ -130,9 +130,7 @@ def _leaps(corners_mm: Float, times_s: Float, run: _Run, standing: list[_Run]) -
     changes = np.flatnonzero(steps_mm > 0)
     speeds = steps_mm / np.diff(times_s)
     elsewhere = np.setdiff1d(changes, [one.last for one in standing])
-    if len(elsewhere) == 0:
-        return False
-    faster = speeds[run.last] > _LEAP * speeds[elsewhere].max()
+    faster = speeds[run.last] > _LEAP * speeds[elsewhere].max(initial=0.0)
     return bool(steps_mm[run.last] > _HARMLESS_MM and faster)
 
 
