@@ -196,6 +196,7 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
     taken.mkdir()
     (taken / "mine.txt").write_text("keep")
     shutil.copytree(path, tmp_path / "50%.zarr")
+    shutil.copytree(path, tmp_path / "two\nlines.zarr")
     broken = tmp_path / "broken.zarr"
     shutil.copytree(path, broken)
     (broken / "potential" / "guide" / "c" / "3" / "0" / "0" / "0").write_bytes(b"short")
@@ -208,10 +209,13 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
         (broken, "mhd", new, "bytes"),
         (path, "mhd", str(path / "inside"), "lies inside the field"),
         (tmp_path / "50%.zarr", "mhd", new, "take a % in the path"),
+        (tmp_path / "two\nlines.zarr", "mhd", new, "ends where the path"),
+        (path, "vti", os.fsdecode(os.fsencode(new) + b"\xe9"), "only where the path is UTF-8"),
     ]:
         assert main(["export", str(field), "--to", form, "--out", out]) == 2
         assert words in capsys.readouterr().err
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["50%.zarr", "broken.zarr", "taken"]
+    left = sorted(one.name for one in tmp_path.iterdir())
+    assert left == ["50%.zarr", "broken.zarr", "taken", "two\nlines.zarr"]
     assert (taken / "mine.txt").read_text() == "keep"
 
 

@@ -16,6 +16,7 @@ from pipeline.errors import InputError
 from pipeline.field import ForceField, files, get_include
 from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
+from pipeline.field.spline import phase_weights, timeline
 from pipeline.field.tool import Needle, Polyline, outside_share
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
@@ -264,6 +265,49 @@ def test_a_compiler_that_takes_no_numbers_for_numbers_is_refused(tmp_path):
     assert b"compile without -ffast-math" in done.stderr
 
 
+NO_NUMBERS = """
+#define BEATFIELD_IMPLEMENTATION
+#include "beatfield.h"
+int main(int count, char **words)
+{
+    bf_field field;
+    double nowhere = strtod("nan", NULL), endless = strtod("inf", NULL), force_n[3];
+    double point_mm[3] = {1, nowhere, 3}, far_mm[3] = {endless, 2, 3}, one[3] = {1, 1, 1};
+    bf_tank tank = bf_full_tank(5, 20);
+    int n, wrong = count != 2 || bf_open(&field, words[1]) != BF_OK;
+    wrong += bf_force(&field, 0, point_mm, 0.3, force_n) != BF_NOT_FINITE || force_n[0] > 0;
+    wrong += bf_force(&field, 0, far_mm, 0.3, force_n) != BF_NOT_FINITE;
+    wrong += bf_force(&field, 0, one, nowhere, force_n) != BF_NOT_FINITE;
+    bf_pass(&tank, point_mm, one);
+    for (n = 0; n < 3; n++) wrong += one[n] < 0 || one[n] > 0;
+    bf_transform(field.mr_from_tracker, one, point_mm); /* not known */
+    wrong += bf_force(&field, 0, point_mm, 0.3, force_n) != BF_NOT_FINITE;
+    one[0] = 1;
+    bf_turn_back(field.mr_from_tracker, one, one);
+    for (n = 0; n < 3; n++) wrong += !(one[n] >= 0 && one[n] <= 0);
+    printf("%d\\n", wrong);
+    bf_close(&field);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize(
+    "options", [["-funsafe-math-optimizations"], ["-ffast-math", "-fno-finite-math-only"]]
+)
+def test_what_is_no_number_is_refused_where_sums_may_be_reordered(
+    path, tmp_path, compiler, options
+):
+    """Options that the header cannot see: Clang then takes x - x for 0 whatever x is."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}")
+    field = described(path, tmp_path / "field.zarr", mr_from_tracker=None)
+    (tmp_path / "own.c").write_text(NO_NUMBERS)
+    program = build(tmp_path / "own.c", tmp_path / "own", "-std=gnu99", *options, compiler=compiler)
+    assert run(program, field).stdout == b"0\n"
+
+
 @pytest.mark.parametrize("standard", ["gnu99", "gnu17"])
 def test_other_declarations_are_left_to_the_program(tmp_path, standard):
     source = tmp_path / "own.c"
@@ -278,6 +322,21 @@ def test_other_declarations_are_left_to_the_program(tmp_path, standard):
 def test_of_any_phase_only_the_fraction_counts(path, phase):
     field = ForceField.open(path)
     assert field.force_at(9.0, 4.0, 2.0, phase) == field.force_at(9.0, 4.0, 2.0, 0.0)
+
+
+@pytest.mark.parametrize("phase", [1e17, -1e300])
+def test_nor_does_more_count_where_the_first_interval_begins_past_0(path, tmp_path, phase):
+    late = described(path, tmp_path / "late.zarr", phases=[0.3, 0.35, 0.4, 0.5, 0.9])
+    field = ForceField.open(late)
+    expected = field.force_at(9.0, 4.0, 2.0, 0.0)
+    assert field.force_at(9.0, 4.0, 2.0, phase) == expected
+    assert phase_weights(timeline(field.phases), phase) == phase_weights(
+        timeline(field.phases), 0.0
+    )
+    (tmp_path / "query.c").write_bytes((HERE.parent / "docs/examples/query.c").read_bytes())
+    query = build(tmp_path / "query.c", tmp_path / "query", "-std=c99")
+    said = [run(query, late, 9, 4, 2, one).stdout for one in (phase, 0)]
+    assert said[0] == said[1] != b""
 
 
 def test_both_languages_tell_the_same_share_outside_the_grid(path, program):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -12,6 +13,7 @@ import nibabel
 import numpy as np
 import pytest
 from cine_files import dicom_frame, read_dicom_cine
+from field_baked import bake_small
 from sweep_files import good_fields, write
 
 from pipeline.errors import InputError
@@ -72,6 +74,17 @@ def test_c_does_not_wait_for_a_pipe_either(tmp_path: Path) -> None:
     ended = subprocess.run(asked, capture_output=True, text=True, timeout=20, check=False)
     assert ended.returncode != 0
     assert "cannot be read" in ended.stderr
+
+    shutil.rmtree(field)
+    bake_small(field)
+    chunk = field / "spline" / "core" / "c" / "2" / "0" / "0" / "0"
+    chunk.unlink()
+    os.mkfifo(chunk)
+    ended = subprocess.run(asked, capture_output=True, text=True, timeout=20, check=False)
+    assert ended.returncode != 0
+    assert "a size is wrong" in ended.stderr
+    with pytest.raises(InputError, match=f"{chunk}: is a pipe"):
+        verify_field(field)
 
 
 @pytest.mark.parametrize(

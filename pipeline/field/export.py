@@ -154,6 +154,12 @@ def _vti(field: _Stored, folder: Path) -> None:
     """One ``.vti`` a phase with all arrays, and a ``.pvd`` that names them with their times."""
     import pyvista
 
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{folder.parent}: VTK writes only where the path is UTF-8; choose another place"
+        ) from error
     rows = []
     for index, time in enumerate(field.times):
         image = pyvista.ImageData(
@@ -178,6 +184,11 @@ def _mhd(field: _Stored, folder: Path) -> None:
         if "%" in chunks[0]:
             raise InputError(
                 f"{chunks[0]}: MetaImage headers take a % in the path to a file for a number; "
+                "rename the folder"
+            )
+        if "\n" in chunks[0] or "\r" in chunks[0]:
+            raise InputError(
+                f"{chunks[0]!r}: a line of a MetaImage header ends where the path to a file does; "
                 "rename the folder"
             )
         for index, chunk in enumerate(chunks):

@@ -163,6 +163,8 @@ def moment_of(line, phase):  # type: ignore[no-untyped-def]
         turned -= np.floor(phase - first)
         if turned >= first + 1.0:
             turned -= 1.0
+        elif turned < first:
+            turned += 1.0  # So large a phase that first is lost in it.
     # Phases are mostly evenly spaced; where they are not, halving finds the interval.
     low = int((turned - first) * count)
     if low < 0 or low >= count or line[low, 0] > turned or line[low, 1] <= turned:

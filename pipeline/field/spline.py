@@ -90,6 +90,8 @@ def phase_weights(line: Float, phase: float) -> tuple[int, tuple[float, float, f
     turned = phase - np.floor(phase - first)
     if turned >= first + 1:
         turned -= 1
+    elif turned < first:
+        turned += 1
     k = max(int(np.searchsorted(line[:, 0], turned, side="right")) - 1, 0)
     start, end, early, late = line[k]
     before = float((end - turned) ** 2 * early)

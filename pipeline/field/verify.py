@@ -160,6 +160,7 @@ def _file_problems(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Iterat
     yield from (f"{name}: is missing" for name in sorted(set(files) - present))
     yield from (f"{name}: is not in the manifest" for name in sorted(present - set(files)))
     for name in sorted(present & set(files)):
+        require_no_device(path / name)
         try:
             actual = entry(path / name)
         except OSError as error:

@@ -253,6 +253,15 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #define BF__INLINE static
 #endif
 
+/* Whether a value is a number, and not infinite: told by its bits, for a compiler that may reorder sums
+ * (-funsafe-math-optimizations) takes x - x for 0 whatever x is. */
+BF__INLINE int bf__numeric(double value)
+{
+    uint64_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return (bits >> 52 & 0x7ff) != 0x7ff;
+}
+
 const char *bf_text(bf_status status)
 {
     switch (status) {
@@ -486,7 +495,7 @@ static int bf__rigid(const double t[16])
     double det, shift = t[3] + t[7] + t[11];
     int a, b;
     if (!(fabs(t[12]) + fabs(t[13]) + fabs(t[14]) + fabs(t[15] - 1) <= 1e-6)) return 0;
-    if (shift - shift != 0) return 0;
+    if (!bf__numeric(shift)) return 0;
     for (a = 0; a < 12; a += 4)
         for (b = 0; b < 12; b += 4) {
             double dot = t[a] * t[b] + t[a + 1] * t[b + 1] + t[a + 2] * t[b + 2];
@@ -1054,7 +1063,8 @@ static bf_status bf__map(const bf__folder *folder, const char *name, size_t byte
 #else
     struct stat about;
     void *mapped;
-    int file = openat(folder->number, name, O_RDONLY);
+    /* A pipe has no bytes, but would let us wait for who writes into it. */
+    int file = openat(folder->number, name, O_RDONLY | O_NONBLOCK);
     if (file < 0) return BF_CANNOT_READ;
     if (fstat(file, &about) != 0 || (uint64_t)about.st_size != (uint64_t)bytes) {
         close(file);
@@ -1254,6 +1264,7 @@ BF__INLINE int bf__interval(const bf_field *field, double phase, double *turned)
     if (!(found >= first && found < first + 1)) {
         found -= floor(phase - first);
         if (found >= first + 1) found -= 1;
+        else if (found < first) found += 1; /* so large a phase that first is lost in it */
     }
     *turned = found;
     /* Phases are mostly evenly spaced; where they are not, halving finds the interval. */
@@ -1453,13 +1464,12 @@ static void bf__push(const bf_fixture_part *law, double distance_mm, const doubl
 static int bf__finite(const double point_mm[3], double phase)
 {
     /* Not a number and infinity both fail this, and so does the sum of huge numbers. */
-    double sum = point_mm[0] + point_mm[1] + point_mm[2] + phase;
-    return sum - sum == 0;
+    return bf__numeric(point_mm[0] + point_mm[1] + point_mm[2] + phase);
 }
 
 /* Whether an answer holds only numbers: a value of the field that is none leaves none in the
  * distance of any answer that it has a part in, whatever its weight. */
-BF__INLINE int bf__sound(double distance_mm) { return distance_mm - distance_mm == 0; }
+BF__INLINE int bf__sound(double distance_mm) { return bf__numeric(distance_mm); }
 
 /* Whether a fixture can be asked about a point. */
 BF__INLINE bf_status bf__answerable(const bf_field *field, int fixture, const double point_mm[3],
@@ -1827,7 +1837,7 @@ void bf_turn_back(const double transform[16], const double vector[3], double tur
     turned[2] = t[2] * x + t[6] * y + t[10] * z;
     /* Of a tracker that is not known no force is handed on. */
     sum = turned[0] + turned[1] + turned[2];
-    if (sum - sum != 0) turned[0] = turned[1] = turned[2] = 0;
+    if (!bf__numeric(sum)) turned[0] = turned[1] = turned[2] = 0;
 }
 
 /* ---- whole tools ---- */
@@ -1955,7 +1965,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (tool->count < 1) return BF_WRONG_SIZE;
     if (!(bound_n > 0)) return BF_WRONG_BOUND;
     for (n = 0, sum = phase; n < 12; n++) sum += mr_from_tool[n];
-    if (sum - sum != 0) return BF_NOT_FINITE;
+    if (!bf__numeric(sum)) return BF_NOT_FINITE;
     if (!bf__rigid(mr_from_tool)) return BF_NOT_RIGID;
     memset(&walk, 0, sizeof walk);
     walk.field = field;
@@ -1967,7 +1977,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     walk.sound = 1;
     walk.pieces = tool->closed ? tool->count : tool->count - 1;
     for (n = 0; n < walk.pieces; n++) total += bf__length(tool, n);
-    if (total - total != 0) return BF_NOT_FINITE;
+    if (!bf__numeric(total)) return BF_NOT_FINITE;
     for (n = 0; n < 3; n++) {
         double edge = (field->shape[n] - 1) * field->spacing_mm[n];
         diagonal2 += edge * edge;
@@ -1990,7 +2000,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (!walk.sound) return BF_DAMAGED;
     /* What no length has told: a handle or an only point that is not finite, or too far away. */
     for (n = 0, sum = 0; n < 3; n++) sum += walk.force_n[n] + walk.torque_nmm[n];
-    if (sum - sum != 0) return BF_NOT_FINITE;
+    if (!bf__numeric(sum)) return BF_NOT_FINITE;
     memcpy(force_n, walk.force_n, sizeof walk.force_n);
     if (torque_nmm) memcpy(torque_nmm, walk.torque_nmm, sizeof walk.torque_nmm);
     if (evaluations) *evaluations = walk.evaluations;
@@ -2072,8 +2082,8 @@ void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
         place += point_mm[axis];
         wanted += force_n[axis];
     }
-    if (place - place != 0 || wanted - wanted != 0) force_n[0] = force_n[1] = force_n[2] = 0;
-    if (place - place != 0) {
+    if (!bf__numeric(place) || !bf__numeric(wanted)) force_n[0] = force_n[1] = force_n[2] = 0;
+    if (!bf__numeric(place)) {
         tank->blind = 1;
         return;
     }
