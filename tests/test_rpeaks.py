@@ -160,6 +160,15 @@ def test_a_lead_that_grows_quiet_is_believed_again_after_a_beat():
     assert usable[3000 + 300 :].all()
 
 
+@pytest.mark.parametrize("rate_hz", [125.0, 1000.0])
+def test_a_sample_missing_here_and_there_costs_nothing(rate_hz):
+    ecg = record(rate_hz=rate_hz)
+    broken = ecg.signal_mv.copy()
+    broken[np.random.default_rng(7).random(len(broken)) < 0.01] = np.nan
+    assert score(ecg, broken)[:2] == (0, 0)
+    assert usable_times(broken, rate_hz).all()
+
+
 def test_missing_samples_are_a_lost_lead():
     ecg = record()
     broken = ecg.signal_mv.copy()

@@ -1,46 +1,173 @@
-"""What the R-peak detector keeps between samples, as arrays that compiled code can hold."""
+"""What the R-peak detector keeps between samples: records whose fields compiled code reads by name.
+
+Each class below is one kind of record. ``records`` makes an array of them from its annotations, and
+the compiler takes ``s.leads[k].noise`` from there. What beats have taught (``Usual``, ``Rhythm``)
+is apart from what merely happens now, so that a beat that turns out to be none is unlearnt as a
+whole. Times are numbers of samples since the first; energies are in a lead's own units, heights of
+waves in units of the usual beat.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import MutableSequence
+from functools import cache
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
-from pipeline.geometry import Float, Integer
+import numpy as np
 
-# Rows of found beats.
-TIME, KNOWN, LEAD, HEIGHT, LIKENESS, LATE, INSTEAD, FIELDS = range(8)
-# Columns of the state of a lead.
-(
-    LEVEL, NOISE, LAST, RUN, JUMPED, BAD_UNTIL, WAY, OFFSET, SHIFT, TIMED, SIZE, WEIGHT,
-    SIGN, SCATTER, LEAN, LEAN_NOW, PEAK, FINER, HEIGHT_MV,
-    SMALLEST_STEP, LOWEST, LOWEST_OLD, LOWEST_OLDER, STILLEST, EPOCH_END, TALL, STEEP,
-    TALL_HERE, STEEP_HERE, LEAD_FIELDS,
-) = range(30)  # fmt: skip
-LEARNT_OF_BEATS = (LEVEL, WAY, OFFSET, SHIFT, TIMED, SIZE, SCATTER, LEAN, TALL, STEEP)
-"""What a beat changes of a lead."""
-# Counters.
-(
-    SEEN,
-    BEST_AT,
-    LAST_BEAT,
-    FOUND,
-    WAITING,
-    INTERVALS,
-    STRANGE,
-    LEARNT,
-    LEARN_AT,
-    USABLE,
-    BEATS,
-    TOWERS,
-    COUNTERS,
-) = range(13)
-# Numbers.
-(
-    BEST, LAST_HEIGHT, BETWEEN, USUAL_RR, LAST_LIKENESS, LAST_STEEP, LAST_TALL, TALL_NOW,
-    STEEP_NOW, NUMBERS,
-) = range(10)  # fmt: skip
-KEPT_INTERVALS, KEPT_WAVES = 8, 64
+from pipeline.geometry import Float
+
+KEPT_INTERVALS, KEPT_WAVES, KEPT_FOUND = 8, 64, 64
 SHAPE_POINTS = 21
 """Places about R at which shapes are compared."""
+
+
+class Usual:
+    """A lead's usual beat, as beats have taught it."""
+
+    level: float
+    """Energy; 0 while unknown."""
+    tall: float
+    steep: float
+    size_mv: float
+    """Height of the main deflection above rest."""
+    way: float
+    """Side of the main deflection: 1 up, -1 down."""
+    lean: float
+    """By how much that side is the larger, in [-1, 1]; below 0 is down."""
+    offset: float
+    """How long after R, as all leads tell it, this one peaks: S does in V1."""
+    shift: float
+    """How far smoothing moves the peak, and how much that scatters."""
+    scatter: float
+    timed: float
+    """How many beats taught this, up to 64."""
+    shape: Annotated[Float, SHAPE_POINTS]
+
+
+class Here:
+    """The same of the wave that was measured last."""
+
+    tall: float
+    steep: float
+    size_mv: float
+    sign: float
+    """Side of the deflection that times it."""
+    lean: float
+    peak: float
+    """Its time, after the middle of the complex."""
+    shift: float
+    shape: Annotated[Float, SHAPE_POINTS]
+
+
+class Lead:
+    """A lead: whether it is connected, how noisy it is, what say it has, and its beats."""
+
+    last: float
+    """Latest sample."""
+    run: int
+    """For how many samples it has not changed."""
+    missing: int
+    """How many samples in succession were none."""
+    jumped: bool
+    """Whether it came to that value by a jump."""
+    bad_until: float
+    """When what disturbed it has left the filters."""
+    smallest_step: float
+    """Step of its converter, as far as seen."""
+    lowest: float
+    """Least swing in this epoch, in the one before, and in the one before that."""
+    lowest_old: float
+    lowest_older: float
+    stillest: float
+    """Least swing since it was lost; infinite while it is not."""
+    wildest: float
+    """Largest swing in this epoch."""
+    quiet: float
+    """Swing that it stays under in three of ten windows since it was lost; 0 while it is not."""
+    quiet_from: float
+    """When that is known."""
+    epoch_end: float
+    noise: float
+    """Energy between its beats."""
+    weight: float
+    """Its say in what the leads tell together; 0 while it shows nothing."""
+    here: Here
+    usual: Usual
+    before: Usual
+    """What was usual before the latest beat, should that be none."""
+
+
+class Rhythm:
+    """The beats so far."""
+
+    beats: int
+    last_at: int
+    last_height: float
+    last_likeness: float
+    last_tall: float
+    last_steep: float
+    strange: int
+    """Beats of another shape in succession."""
+    intervals: int
+    """RR intervals so far, of which the latest are kept."""
+    interval: Annotated[Float, KEPT_INTERVALS]
+    usual_rr: float
+    """Their mean."""
+
+
+class Now:
+    """Where the detector stands."""
+
+    seen: int
+    """Samples taken."""
+    learnt: bool
+    """Whether levels are known, so that waves can be judged."""
+    learn_at: int
+    """When levels were learnt last, or tried to be."""
+    usable: bool
+    """Whether some lead is connected."""
+    best: float
+    """Height of what may become the next wave, and when."""
+    best_at: int
+    between: float
+    """Height of waves between beats."""
+    tall: float
+    """Height and steepness of the wave measured last, as shares of the usual beat's."""
+    steep: float
+    towers: int
+    """First beats that towered over the others."""
+    waiting: int
+    """Waves that were no beats since the last beat, of which the latest are kept."""
+    found: int
+    """Beats that became known with this block of samples."""
+    rhythm: Rhythm
+    before: Rhythm
+    """The same before the latest beat, should that be none."""
+
+
+class Wave:
+    """One that was no beat, kept for when a beat is overdue."""
+
+    at: int
+    height: float
+    tall: float
+    steep: float
+
+
+class Found:
+    """A beat that became known."""
+
+    time_s: float
+    known_at: int
+    lead: int
+    """The one that shows it best."""
+    height: float
+    likeness: float
+    """Correlation of its shape with the usual one."""
+    late: bool
+    instead: bool
+    """Told in the place of the beat before, which was its P wave."""
 
 
 class Plan(NamedTuple):
@@ -59,23 +186,17 @@ class Plan(NamedTuple):
     """How much is seen before the first decision."""
 
 
-class Learnt(NamedTuple):
-    """What was known before the latest beat, to be restored where that was none."""
-
-    leads: Float
-    shapes: Float
-    intervals: Float
-    counters: Integer
-    numbers: Float
-
-
 class State(NamedTuple):
-    """Everything that changes while samples come in."""
+    """Kernels, and everything that changes while samples come in.
+
+    Arrays of records are typed as what they behave like. They are few: each costs time with every
+    call of compiled code.
+    """
 
     even: Float
+    """Kernels ``(taps,)``: the wavelet's two parts, and two smoothings for timing."""
     odd: Float
     coarse: Float
-    """Kernels ``(taps,)``: the wavelet's two parts, and two smoothings for timing."""
     fine: Float
     raw: Float
     """``(leads, 2 length)``."""
@@ -85,16 +206,30 @@ class State(NamedTuple):
     """``(leads, length)`` root of its mean."""
     fused: Float
     """``(length,)`` energy of all leads in units of a beat."""
-    waves: Float
-    """``(KEPT_WAVES, 4)`` latest waves that were no beats: sample, energy, steepness, height."""
-    intervals: Float
-    """``(KEPT_INTERVALS,)`` latest RR intervals in samples."""
-    leads: Float
-    shapes: Float
-    """``(leads, SHAPE_POINTS)`` usual shape of a beat."""
-    seen: Float
-    """``(leads, SHAPE_POINTS)`` shape of the beat that was measured last."""
-    found: Float
-    counters: Integer
-    numbers: Float
-    before: Learnt
+    leads: MutableSequence[Lead]
+    now: MutableSequence[Now]
+    """One record."""
+    waves: MutableSequence[Wave]
+    """``KEPT_WAVES``, a ring."""
+    found: MutableSequence[Found]
+
+
+def records(kind: type, count: int) -> Any:
+    """``(count,)`` records with the fields of a class, all zero."""
+    return np.zeros(count, _layout(kind))
+
+
+@cache
+def _layout(kind: Any) -> Any:
+    """How a field, or a class of fields, lies in memory: as in a C struct.
+
+    One object for each: of layouts that are merely equal the compiler has to look at every field
+    with every call, 2 to 4 us a sample.
+    """
+    if kind in (float, int, bool):
+        return np.dtype(kind)
+    if get_args(kind):
+        _, length = get_args(kind)
+        return np.dtype((float, length))
+    hints = get_type_hints(kind, include_extras=True)
+    return np.dtype([(name, _layout(hint)) for name, hint in hints.items()], align=True)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import KEPT_WAVES, LEVEL, NOISE, WEIGHT, Plan, State
+from pipeline.registration.detector_state import KEPT_WAVES, Lead, Plan, State
 
 REFRACTORY_S = 0.20
 """No two beats are closer together."""
 LONE = 0.5
 """A wave stands out alone where the next lower one has less than so much of its energy."""
+LEAST_NOISE = 0.02
+"""No lead has less energy than this share of its beats' between them; a silent one would weigh all.
+"""
 
 
 @compiled
@@ -43,20 +45,21 @@ def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[fl
 
 
 @compiled
-def follow_noise(lead: Float, energy: float, rate_hz: float) -> None:
+def follow_noise(lead: Lead, energy: float, rate_hz: float) -> None:
     """Track the energy that 7 samples in 10 stay under: QRS complexes take less than 3."""
     step = 4.0 / rate_hz
-    lead[NOISE] *= 1.0 + 0.7 * step if energy > lead[NOISE] else 1.0 - 0.3 * step
-    lead[NOISE] = max(lead[NOISE], 0.02 * lead[LEVEL])
+    lead.noise *= 1.0 + 0.7 * step if energy > lead.noise else 1.0 - 0.3 * step
+    lead.noise = max(lead.noise, LEAST_NOISE * lead.usual.level)
 
 
 @compiled
-def learn_level(lead: Float, energy: float, late: float) -> None:
+def learn_level(lead: Lead, energy: float, late: bool) -> None:
     """Move the level of a lead's beats a little towards this one, in the logarithm."""
+    usual = lead.usual
     if energy <= 0.0:
         return
-    if lead[LEVEL] <= 0.0:
-        lead[LEVEL], lead[NOISE] = energy, 0.2 * energy
-    elif lead[WEIGHT] > 0.0:
-        ratio = min(max(energy / lead[LEVEL], 0.5), 2.0)
-        lead[LEVEL] *= ratio ** (0.3 if late > 0.0 else 0.15)
+    if usual.level <= 0.0:
+        usual.level, lead.noise = energy, 0.2 * energy
+    elif lead.weight > 0.0:
+        ratio = min(max(energy / usual.level, 0.5), 2.0)
+        usual.level *= ratio ** (0.3 if late else 0.15)

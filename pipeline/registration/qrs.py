@@ -2,13 +2,26 @@
 
 The design is that of J. Pan and W. J. Tompkins, "A real-time QRS detection algorithm", IEEE Trans
 Biomed Eng 32 (1985) 230-236, with the rules of P. Hamilton, "Open source ECG analysis", Comput
-Cardiol 29 (2002) 101-104: energy in the band of the QRS complex, levels of beats and of noise with
-a threshold between them, a second look at half the threshold when a beat is overdue, and a bar for
-T waves. Three things differ. The energy is the envelope of one complex wavelet (a Gaussian's second
-derivative and its Hilbert transform), which does not depend on polarity and weighs a T wave as high
-as R with a sixth. Leads add up, each in units of its own beats, weighted by how far those stand out
-of what lies between (inverse variance), so a lead that is lost or noisy has no say. And all is
-reckoned in seconds: sampling rates differ in nothing but the number of samples.
+Cardiol 29 (2002) 101-104. Three things differ: one wavelet's envelope for the energy, leads that
+add up, and seconds for samples, so that rates differ in nothing but the number of samples.
+
+With every sample, in this order:
+
+1. ``_store``: it goes into a ring, and ``quality`` judges whether its lead is still connected.
+2. ``_filter``: energy in the band of the QRS complex is the mean envelope of one complex wavelet (a
+   Gaussian's second derivative and its Hilbert transform). It does not depend on polarity and
+   weighs a T wave as high as R with a sixth.
+3. ``_learn``: until beats are plain to see, levels of beats and of what lies between them are
+   sought in all samples so far (``levels``); then all of these are gone through anew.
+4. ``_fuse``: leads add up, each in units of its own beats, weighted by how far those stand out of
+   what lies between (inverse variance), so a lead that is lost or noisy has no say.
+5. ``_decide``: the highest sum that nothing exceeded for ``confirm`` samples is a wave. ``_judge``
+   takes it for a beat if it is none of noise, T waves and P waves (``rules``). It may also show
+   that the beat before was its P wave: that one is unlearnt.
+6. ``_look_back``: when a beat is overdue, the highest wave since the last one is judged again, by
+   lower thresholds; after a long silence levels are learnt again.
+7. ``_accept``: a beat, timed by its shape (``waves``), is told; levels, intervals and shapes
+   follow it.
 """
 
 from __future__ import annotations
@@ -17,116 +30,100 @@ import math
 
 from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import (
-    BAD_UNTIL,
-    BEATS,
-    BEST,
-    BEST_AT,
-    BETWEEN,
-    FOUND,
-    HEIGHT,
-    INSTEAD,
-    INTERVALS,
-    KEPT_INTERVALS,
-    KEPT_WAVES,
-    KNOWN,
-    LAST,
-    LAST_BEAT,
-    LAST_HEIGHT,
-    LAST_LIKENESS,
-    LAST_STEEP,
-    LAST_TALL,
-    LATE,
-    LEARN_AT,
-    LEARNT,
-    LEARNT_OF_BEATS,
-    LEVEL,
-    LIKENESS,
-    NOISE,
-    RUN,
-    SEEN,
-    STEEP,
-    STEEP_NOW,
-    STRANGE,
-    TALL,
-    TALL_NOW,
-    USABLE,
-    USUAL_RR,
-    WAITING,
-    WEIGHT,
-    Plan,
-    State,
+from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
+from pipeline.registration.levels import (
+    LEAST_NOISE,
+    REFRACTORY_S,
+    follow_noise,
+    learn_level,
+    wave_levels,
 )
-from pipeline.registration.levels import REFRACTORY_S, follow_noise, learn_level, wave_levels
-from pipeline.registration.quality import RUN_S, SETTLE_S, shows_nothing, watch
+from pipeline.registration.quality import BRIDGED_S, RUN_S, SETTLE_S, shows_nothing, watch
 from pipeline.registration.rules import (
-    DULL,
     LATE_T_WAVE_S,
+    LONG_AHEAD_S,
     T_WAVE_S,
     VERY_ALIKE,
     is_beat,
+    last_may_be_p_wave,
     learn_stature,
     measure_stature,
+    outdoes_last,
     resembles,
     towers,
 )
 from pipeline.registration.waves import learn_beat, measure_beat
 
-AHEAD_S, LONG_AHEAD_S, AHEAD, LOW, OWN = 0.25, 0.32, 2.0, 0.7, 0.98
-"""A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
-ventricle beats twice in that time; up to the second time, if it was duller for its height, too.
-Unless it is just like a beat and came when one was due: a tug at the electrode may follow a small
-beat. P waves come too soon, and are 0.90 to 0.98 like beats."""
+# When a beat is overdue, and what then.
+OVERDUE = 1.5
+"""A beat is overdue after so many mean RR intervals (Pan and Tompkins: 1.66)."""
 PATIENCE_S = 0.3
 """A low wave is taken for a missed beat no sooner: it may be the P wave of a beat to come."""
-OVERDUE = 1.5
-"""A beat is overdue after so many mean RR intervals."""
-KNOCK = 8.0
-"""Energy, in units of a lead's beats, that no beat has."""
+SILENCE, SILENCE_S = 2.5, 2.5
+"""After so many RR intervals and seconds without a beat levels are learnt again."""
+LONGEST_RR_S = 3.0
+"""What is longer holds beats that were missed, and is none of the intervals."""
+
+# When levels hold.
 CLEAR, UNCLEAR = 3.5, 2.0
 """Beats have at least so many times the energy of what lies between them where they are plain to
 see; waves that have less than so many times are none, or not all of them."""
+RACING = 1.65
+"""The same of a heart at 200 a minute, which hardly rests; noise of any colour reaches 1.55."""
 MOST_S, LOOK_S = 6.0, 0.25
 """Where no beat is plain to see after ``LEARN_S`` it is looked for this long, this often."""
+RECENT_S = 4.0
+"""When beats are unclear levels are learnt again by the waves of so many seconds."""
 FALL = 0.7
 """Levels fall no lower at once than to this share, unless a wave looks like the usual beat."""
-SILENCE, SILENCE_S, RECENT_S = 2.5, 2.5, 4.0
-"""After so many RR intervals and seconds without a beat levels are learnt again; and by the waves
-of so many seconds when beats are unclear."""
+
+# What a single lead or wave may say.
+MOST_CONTRAST, MOST_ENERGY = 20.0, 2.0
+"""However clear a lead, it weighs no more than with the first ratio of beats to noise; and however
+high a wave, no lead says more than so many of its beats."""
+KNOCK, GAIN = 8.0, 1.3
+"""Energy, in units of a lead's beats, that no beat has: the lead was knocked. Its level grows by a
+factor each time: should beats have become so much larger, they count after some of them."""
+MOST_BETWEEN = 0.6
+"""Height that a wave between beats counts with at most."""
 
 
 @compiled
-def feed(block: Float, plan: Plan, s: State) -> None:
-    """Take ``(n, leads)`` samples; beats that became known are rows of ``s.found``."""
-    s.counters[FOUND] = 0
+def feed(block: Float, plan: Plan, s: State) -> int:
+    """Take ``(n, leads)`` samples; how many beats became known: the first of ``s.found``."""
+    now = s.now[0]
+    now.found = 0
     for row in range(len(block)):
         _store(block[row], plan, s)
-        now = s.counters[SEEN]
-        s.counters[SEEN] = now + 1
-        middle = now - plan.half - plan.mean
+        at = now.seen
+        now.seen = at + 1
+        middle = at - plan.half - plan.mean
         if middle < 0:
             continue
-        if s.counters[LEARNT]:
+        if now.learnt:
             _decide(middle, plan, s)
-        elif now - s.counters[LEARN_AT] >= plan.learn:
+        elif at - now.learn_at >= plan.learn:
             _learn(middle, plan, s)
+    return now.found
 
 
 @compiled
 def _store(sample: Float, plan: Plan, s: State) -> None:
     """Put one sample of every lead into the rings, and filter."""
-    now, length = s.counters[SEEN], plan.length
+    now, length = s.now[0].seen, plan.length
     at = now % length
     for k in range(len(sample)):
         lead, value = s.leads[k], sample[k]
-        if not math.isfinite(value):
-            value = lead[LAST]
-            lead[BAD_UNTIL] = now + SETTLE_S * plan.rate_hz
+        lead.missing = 0 if math.isfinite(value) else lead.missing + 1
+        if lead.missing > 0:
+            value = lead.last
+        if lead.missing > max(1.0, BRIDGED_S * plan.rate_hz):
+            lead.bad_until = now + SETTLE_S * plan.rate_hz
         if now == 0:
             s.raw[k, :] = value
         else:
             watch(lead, s.raw[k], value, now, plan)
-        lead[LAST] = value
+        lead.last = value
         s.raw[k, at] = value
         s.raw[k, at + length] = value
         _filter(k, now, plan, s)
@@ -155,21 +152,22 @@ def _filter(k: int, now: int, plan: Plan, s: State) -> None:
 @compiled
 def _learn(middle: int, plan: Plan, s: State) -> None:
     """First levels, from all that has been seen; then decide about all of that."""
+    now = s.now[0]
     first = max(0, middle - plan.length + 4 * plan.half)
-    clear = False
+    clear, highest = False, 0.0
     for k in range(len(s.leads)):
         level, noise, lone = wave_levels(k, first, middle, plan, s)
-        s.leads[k, LEVEL] = level
-        s.leads[k, NOISE] = max(noise, 0.02 * level)
+        s.leads[k].usual.level, s.leads[k].noise = level, max(noise, LEAST_NOISE * level)
         clear = clear or (level > CLEAR * noise and not lone)
+        highest = max(highest, level)
     # A slow heart may not have beaten yet.
-    s.counters[LEARN_AT] = s.counters[SEEN] + int(LOOK_S * plan.rate_hz) - plan.learn
-    if not clear and (middle - first < MOST_S * plan.rate_hz or s.leads[:, LEVEL].max() <= 0.0):
+    now.learn_at = now.seen + int(LOOK_S * plan.rate_hz) - plan.learn
+    if not clear and (middle - first < MOST_S * plan.rate_hz or highest <= 0.0):
         return
-    s.counters[LEARNT] = 1
+    now.learnt = True
     learn_stature(first, middle, plan, s)
     # A record may begin with a beat; none is overdue yet.
-    s.counters[LAST_BEAT] = first - int(T_WAVE_S * plan.rate_hz)
+    s.now[0].rhythm.last_at = first - int(T_WAVE_S * plan.rate_hz)
     for i in range(first, middle + 1):
         _decide(i, plan, s)
 
@@ -177,219 +175,220 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
 @compiled
 def _decide(i: int, plan: Plan, s: State) -> None:
     """Look at the energy at sample ``i``: has a wave passed, is a beat overdue?"""
+    now = s.now[0]
     for k in range(len(s.leads)):
         follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
-    height = _height(i, plan, s)
+    height = _fuse(i, plan, s)
     s.fused[i % plan.length] = height
-    if height > s.numbers[BEST]:
-        s.numbers[BEST] = height
-        s.counters[BEST_AT] = i
-    elif i - s.counters[BEST_AT] >= plan.confirm:
-        at = s.counters[BEST_AT]
-        s.numbers[BEST] = -1.0
-        s.counters[BEST_AT] = i
+    if height > now.best:
+        now.best, now.best_at = height, i
+    elif i - now.best_at >= plan.confirm:
+        at = now.best_at
+        now.best, now.best_at = -1.0, i
+        # Else it only falls from a wave that was judged.
         if s.fused[at % plan.length] > s.fused[(at - 1) % plan.length]:
             _judge(at, plan, s)
-    if i - s.counters[LAST_BEAT] > OVERDUE * s.numbers[USUAL_RR]:
+    if i - s.now[0].rhythm.last_at > OVERDUE * s.now[0].rhythm.usual_rr:
         _look_back(i, plan, s)
 
 
 @compiled
-def _height(i: int, plan: Plan, s: State) -> float:
-    """Energy of all leads that are connected at sample ``i``, 1 for a usual beat."""
-    total, weights, now = 0.0, 0.0, s.counters[SEEN]
+def _fuse(i: int, plan: Plan, s: State) -> float:
+    """Weigh all leads by what they show now: their energy at sample ``i``, 1 for a usual beat."""
+    total, weights, now = 0.0, 0.0, s.now[0].seen
     usable = False
     for k in range(len(s.leads)):
-        lead = s.leads[k]
-        flat = lead[RUN] >= RUN_S * plan.rate_hz
-        gone = now < lead[BAD_UNTIL]
+        lead, level = s.leads[k], s.leads[k].usual.level
+        off = lead.run >= RUN_S * plan.rate_hz or now < lead.bad_until
         usable = usable or not shows_nothing(lead, now, plan.rate_hz)
-        lead[WEIGHT] = 0.0
-        if flat or gone or lead[LEVEL] <= 0.0:
+        lead.weight = 0.0
+        if off or level <= 0.0:
             continue
-        contrast = min(lead[LEVEL] / lead[NOISE], 20.0)
-        lead[WEIGHT] = contrast * contrast
-        weights += lead[WEIGHT]
-        total += lead[WEIGHT] * min(s.energy[k, i % plan.length] / lead[LEVEL], 2.0)
-    s.counters[USABLE] = 1 if usable else 0
+        contrast = min(level / lead.noise, MOST_CONTRAST)
+        lead.weight = contrast * contrast
+        weights += lead.weight
+        total += lead.weight * min(s.energy[k, i % plan.length] / level, MOST_ENERGY)
+    s.now[0].usable = usable
     return total / weights if weights > 0.0 else 0.0
 
 
 @compiled
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
-    since_s = (at - s.counters[LAST_BEAT]) / plan.rate_hz
-    low = s.numbers[LAST_HEIGHT] < LOW and not _was_due(at, s)
-    ahead = since_s < LONG_AHEAD_S and s.counters[BEATS] > 1 and low
-    if since_s < REFRACTORY_S and not ahead:
+    since_s = (at - s.now[0].rhythm.last_at) / plan.rate_hz
+    doubted = since_s < LONG_AHEAD_S and last_may_be_p_wave(at, s)
+    if since_s < REFRACTORY_S and not doubted:
         return
     # Leads that turned out to be lost since then no longer count.
     _refuse_knocks(at, plan, s)
-    height = _height(at, plan, s)
+    height = _fuse(at, plan, s)
     measure_stature(at, plan, s)
-    instead = ahead and height > AHEAD * s.numbers[LAST_HEIGHT]
-    if instead and since_s >= AHEAD_S:
-        sharp = s.numbers[LAST_TALL] * s.numbers[STEEP_NOW]
-        instead = s.numbers[LAST_STEEP] * s.numbers[TALL_NOW] < DULL * sharp
+    instead = doubted and outdoes_last(since_s, height, s)
     if instead:
-        since_s = (at - s.before.counters[LAST_BEAT]) / plan.rate_hz
+        since_s = (at - s.now[0].before.last_at) / plan.rate_hz
     if since_s < REFRACTORY_S:
         return
-    if is_beat(since_s, height, 1.0, plan, s) and resembles(at, height, 1.0, plan, s):
+    if is_beat(since_s, height, False, plan, s) and resembles(at, height, False, plan, s):
         if instead:
             _take_back(s)
-            measure_beat(at, s.found[s.counters[FOUND]], plan, s)
-        s.found[s.counters[FOUND], INSTEAD] = 1.0 if instead else 0.0
-        _accept(at, height, 0.0, plan, s)
-        return
-    s.numbers[BETWEEN] += 0.125 * (min(height, 0.6) - s.numbers[BETWEEN])
-    kept = s.counters[WAITING] % KEPT_WAVES
-    s.waves[kept, 0], s.waves[kept, 1] = at, height
-    s.waves[kept, 2], s.waves[kept, 3] = s.numbers[STEEP_NOW], s.numbers[TALL_NOW]
-    s.counters[WAITING] += 1
-
-
-@compiled
-def _was_due(at: int, s: State) -> bool:
-    """Whether the last beat looks like one and ends the interval before it better than a wave."""
-    usual, before = s.before.numbers[USUAL_RR], s.before.counters[LAST_BEAT]
-    off, off_now = abs(s.counters[LAST_BEAT] - before - usual), abs(at - before - usual)
-    return bool(s.numbers[LAST_LIKENESS] >= OWN and off < off_now)
+            measure_beat(at, s.found[s.now[0].found], plan, s)
+        _accept(at, height, False, instead, plan, s)
+    else:
+        _keep(at, height, s)
 
 
 @compiled
 def _take_back(s: State) -> None:
     """The last beat was none: know what was known before it, and that such a wave is no beat."""
-    low = min(s.numbers[LAST_HEIGHT], 0.6)
-    s.numbers[BETWEEN] += 0.25 * max(low - s.numbers[BETWEEN], 0.0)
-    for number in (LAST_HEIGHT, LAST_LIKENESS, LAST_STEEP, LAST_TALL, USUAL_RR):
-        s.numbers[number] = s.before.numbers[number]
-    for counter in (LAST_BEAT, BEATS, INTERVALS, STRANGE):
-        s.counters[counter] = s.before.counters[counter]
-    for column in LEARNT_OF_BEATS:
-        s.leads[:, column] = s.before.leads[:, column]
-    s.shapes[:] = s.before.shapes
-    s.intervals[:] = s.before.intervals
+    now, low = s.now[0], min(s.now[0].rhythm.last_height, MOST_BETWEEN)
+    now.between += 0.25 * max(low - now.between, 0.0)
+    now.rhythm = now.before
+    for lead in s.leads:
+        lead.usual = lead.before
 
 
 @compiled
-def _keep(s: State) -> None:
-    """Keep what is known before a beat, should it be none."""
-    s.before.leads[:] = s.leads
-    s.before.shapes[:] = s.shapes
-    s.before.intervals[:] = s.intervals
-    s.before.counters[:] = s.counters
-    s.before.numbers[:] = s.numbers
+def _keep(at: int, height: float, s: State) -> None:
+    """A wave that was no beat: learn from it, and keep it for when one is overdue."""
+    now = s.now[0]
+    now.between += 0.125 * (min(height, MOST_BETWEEN) - now.between)
+    wave = s.waves[now.waiting % KEPT_WAVES]
+    wave.at, wave.height, wave.tall, wave.steep = at, height, now.tall, now.steep
+    now.waiting += 1
 
 
 @compiled
 def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
     """Take the say from leads whose energy near a wave is beyond any beat's: they were knocked."""
     for k in range(len(s.leads)):
-        lead, most = s.leads[k], 0.0
+        lead, usual, most = s.leads[k], s.leads[k].usual, 0.0
         for i in range(at - plan.confirm, at + plan.confirm + 1):
             most = max(most, s.energy[k, i % plan.length])
-        if most > KNOCK * lead[LEVEL] > 0.0:
-            lead[BAD_UNTIL] = max(lead[BAD_UNTIL], s.counters[SEEN] + 1.0)
-            # Should beats have become so much larger, they count after some of them.
-            lead[LEVEL] *= 1.3
+        if most > KNOCK * usual.level > 0.0:
+            lead.bad_until = max(lead.bad_until, s.now[0].seen + 1.0)
+            usual.level *= GAIN
 
 
 @compiled
 def _look_back(i: int, plan: Plan, s: State) -> None:
     """A beat is overdue: take the highest wave since the last one, or lower the levels."""
-    best = -1
-    for k in range(min(s.counters[WAITING], KEPT_WAVES)):
-        since_s = (s.waves[k, 0] - s.counters[LAST_BEAT]) / plan.rate_hz
-        fits = since_s >= REFRACTORY_S and i - s.waves[k, 0] >= PATIENCE_S * plan.rate_hz
-        s.numbers[STEEP_NOW], s.numbers[TALL_NOW] = s.waves[k, 2], s.waves[k, 3]
-        fits = fits and is_beat(since_s, s.waves[k, 1], 0.5, plan, s)
-        if fits and (best < 0 or s.waves[k, 1] > s.waves[best, 1]):
-            best = k
+    now, rhythm, rate_hz = s.now[0], s.now[0].rhythm, plan.rate_hz
+    best = _highest_kept(i, plan, s)
     if best >= 0:
-        at, height = int(s.waves[best, 0]), s.waves[best, 1]
+        wave = s.waves[best]
         # Of a wave that is kept only the sum over all leads is known.
-        measure_stature(at, plan, s)
-        if resembles(at, height, 0.5, plan, s):
-            s.found[s.counters[FOUND], INSTEAD] = 0.0
-            _accept(at, height, 1.0, plan, s)
+        measure_stature(wave.at, plan, s)
+        if resembles(wave.at, wave.height, True, plan, s):
+            _accept(wave.at, wave.height, True, False, plan, s)
             return
-        s.waves[best, 1] = 0.0
-    silent_s = (i - max(s.counters[LAST_BEAT], s.counters[LEARN_AT])) / plan.rate_hz
-    if silent_s > max(SILENCE_S, SILENCE * s.numbers[USUAL_RR] / plan.rate_hz):
-        first = s.counters[LAST_BEAT] + int(LATE_T_WAVE_S * plan.rate_hz)
-        _learn_again(first, i - int(PATIENCE_S * plan.rate_hz), plan, s)
+        wave.height = 0.0
+    silent_s = (i - max(rhythm.last_at, now.learn_at)) / rate_hz
+    if silent_s > max(SILENCE_S, SILENCE * rhythm.usual_rr / rate_hz):
+        first = rhythm.last_at + int(LATE_T_WAVE_S * rate_hz)
+        bar = RACING if i - rhythm.last_at > MOST_S * rate_hz else CLEAR
+        _learn_again(first, i - int(PATIENCE_S * rate_hz), bar, plan, s)
 
 
 @compiled
-def _learn_again(first: int, last: int, plan: Plan, s: State) -> None:
+def _highest_kept(i: int, plan: Plan, s: State) -> int:
+    """The highest wave since the last beat that is high enough for one; -1 if there is none."""
+    now, best = s.now[0], -1
+    for k in range(min(now.waiting, KEPT_WAVES)):
+        wave = s.waves[k]
+        since_s = (wave.at - s.now[0].rhythm.last_at) / plan.rate_hz
+        now.tall, now.steep = wave.tall, wave.steep
+        if (
+            since_s >= REFRACTORY_S
+            and i - wave.at >= PATIENCE_S * plan.rate_hz
+            and is_beat(since_s, wave.height, True, plan, s)
+            and (best < 0 or wave.height > s.waves[best].height)
+        ):
+            best = k
+    return best
+
+
+@compiled
+def _learn_again(first: int, last: int, bar: float, plan: Plan, s: State) -> None:
     """Beats may have become smaller, or what was taken for beats was none: new levels.
 
-    Levels fall at once if the highest wave looks like a usual beat, and slowly if it does not: it
-    may be a P wave that no beat follows.
+    They are learnt from leads whose waves have more than ``bar`` times the energy of what lies
+    between them. Levels fall at once if the highest wave looks like a usual beat, and slowly if it
+    does not: it may be a P wave that no beat follows.
     """
-    s.counters[LEARN_AT] = s.counters[SEEN]
+    s.now[0].learn_at = s.now[0].seen
     first = max(first, last - plan.length + 4 * plan.half, 0)
     highest = first
     for i in range(first, last + 1):
         if s.fused[i % plan.length] > s.fused[highest % plan.length]:
             highest = i
-    measure_beat(highest, s.found[s.counters[FOUND]], plan, s)
-    least = 0.0 if s.found[s.counters[FOUND], LIKENESS] >= VERY_ALIKE else FALL
+    wave = s.found[s.now[0].found]
+    measure_beat(highest, wave, plan, s)
+    least = 0.0 if wave.likeness >= VERY_ALIKE else FALL
     for k in range(len(s.leads)):
-        lead = s.leads[k]
+        lead, usual = s.leads[k], s.leads[k].usual
         # A lead that is off says nothing about how large its beats are.
-        if lead[WEIGHT] <= 0.0:
+        if lead.weight <= 0.0:
             continue
         level, noise, _ = wave_levels(k, first, last, plan, s)
-        if level > CLEAR * noise:
-            level = max(level, least * lead[LEVEL])
-            for column in (TALL, STEEP):
-                lead[column] *= level / lead[LEVEL] if lead[LEVEL] > 0.0 else 0.0
-            lead[LEVEL], lead[NOISE] = level, noise
+        if level > bar * noise:
+            level = max(level, least * usual.level)
+            change = level / usual.level if usual.level > 0.0 else 0.0
+            usual.tall *= change
+            usual.steep *= change
+            usual.level, lead.noise = level, noise
 
 
 @compiled
-def _accept(at: int, height: float, late: float, plan: Plan, s: State) -> None:
-    """A beat: time it, learn from it, and report it."""
-    row, anew = s.found[s.counters[FOUND]], towers(height, s)
-    _keep(s)
+def _accept(at: int, height: float, late: bool, instead: bool, plan: Plan, s: State) -> None:
+    """A beat that was measured: learn from it, and report it."""
+    now, rhythm, wave = s.now[0], s.now[0].rhythm, s.found[s.now[0].found]
+    anew = towers(height, s)
+    now.before = now.rhythm
+    for lead in s.leads:
+        lead.before = lead.usual
     _learn_interval(at, plan, s)
-    s.counters[LAST_BEAT] = at
-    s.numbers[LAST_HEIGHT], s.numbers[LAST_LIKENESS] = height, row[LIKENESS]
-    s.numbers[LAST_STEEP], s.numbers[LAST_TALL] = s.numbers[STEEP_NOW], s.numbers[TALL_NOW]
-    kept = 0
-    for k in range(min(s.counters[WAITING], KEPT_WAVES)):
-        if s.waves[k, 0] > at:
-            s.waves[kept, :] = s.waves[k, :]
-            kept += 1
-    s.counters[WAITING] = kept
-    contrast = 0.0
+    rhythm.last_at, rhythm.last_height, rhythm.last_likeness = at, height, wave.likeness
+    rhythm.last_tall, rhythm.last_steep = now.tall, now.steep
     if anew:
-        s.counters[INTERVALS], s.numbers[USUAL_RR] = 0, plan.rate_hz
+        rhythm.intervals, rhythm.usual_rr = 0, plan.rate_hz
+    _drop_waves(at, s)
+    contrast = 0.0
     for k in range(len(s.leads)):
+        lead, usual, energy = s.leads[k], s.leads[k].usual, s.energy[k, at % plan.length]
         if anew:
-            s.leads[k, LEVEL] = max(s.leads[k, LEVEL], s.energy[k, at % plan.length])
-        learn_level(s.leads[k], s.energy[k, at % plan.length], late)
-        if s.leads[k, WEIGHT] > 0.0:
-            contrast = max(contrast, s.leads[k, LEVEL] / s.leads[k, NOISE])
-    row[KNOWN], row[HEIGHT], row[LATE] = s.counters[SEEN] - 1, height, late
-    learn_beat(at, row, anew, plan, s)
-    s.counters[FOUND] += 1
-    if contrast < UNCLEAR and at - s.counters[LEARN_AT] > RECENT_S * plan.rate_hz:
-        _learn_again(at - int(RECENT_S * plan.rate_hz), at, plan, s)
+            usual.level = max(usual.level, energy)
+        learn_level(lead, energy, late)
+        if lead.weight > 0.0:
+            contrast = max(contrast, usual.level / lead.noise)
+    wave.known_at, wave.height, wave.late, wave.instead = now.seen - 1, height, late, instead
+    learn_beat(at, wave, anew, plan, s)
+    now.found += 1
+    if contrast < UNCLEAR and at - now.learn_at > RECENT_S * plan.rate_hz:
+        _learn_again(at - int(RECENT_S * plan.rate_hz), at, CLEAR, plan, s)
+
+
+@compiled
+def _drop_waves(at: int, s: State) -> None:
+    """Of the waves that are kept only those after the last beat may still be beats."""
+    now, kept = s.now[0], 0
+    for k in range(min(now.waiting, KEPT_WAVES)):
+        if s.waves[k].at > at:
+            s.waves[kept] = s.waves[k]
+            kept += 1
+    now.waiting = kept
 
 
 @compiled
 def _learn_interval(at: int, plan: Plan, s: State) -> None:
-    interval = float(at - s.counters[LAST_BEAT])
-    s.counters[BEATS] += 1
-    if s.counters[BEATS] < 2 or interval > 3.0 * plan.rate_hz:
+    rhythm = s.now[0].rhythm
+    interval = float(at - rhythm.last_at)
+    rhythm.beats += 1
+    if rhythm.beats < 2 or interval > LONGEST_RR_S * plan.rate_hz:
         return
-    s.intervals[s.counters[INTERVALS] % KEPT_INTERVALS] = interval
-    s.counters[INTERVALS] += 1
-    count = min(s.counters[INTERVALS], KEPT_INTERVALS)
+    rhythm.interval[rhythm.intervals % KEPT_INTERVALS] = interval
+    rhythm.intervals += 1
+    count = min(rhythm.intervals, KEPT_INTERVALS)
     mean = 0.0
     for k in range(count):
-        mean += s.intervals[k] / count
-    s.numbers[USUAL_RR] = mean
+        mean += rhythm.interval[k] / count
+    rhythm.usual_rr = mean

@@ -10,17 +10,27 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.registration import detector_state as at
-from pipeline.registration.detector_state import Plan, State
+from pipeline.registration.detector_state import (
+    KEPT_FOUND,
+    KEPT_WAVES,
+    Found,
+    Lead,
+    Now,
+    Plan,
+    State,
+    Wave,
+    records,
+)
 from pipeline.registration.qrs import feed
 from pipeline.registration.waves import ALIKE
 
@@ -43,6 +53,8 @@ _HALF_S, _MEAN_S, _CONFIRM_S = 0.050, 0.025, 0.055
 _COARSE_S, _FINE_S = 0.008, 0.004
 _MEMORY_S = 8.0
 _CHUNK_S = 5.0
+
+Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,36 +132,35 @@ class RPeakDetector:
             raise InputError(
                 f"ECG: samples of shape {np.shape(samples_mv)}; needs (n, {self._leads})"
             )
-        rows = [row for part in self._parts(block) for row in self._feed(part)]
-        return [self._beat(row) for row in rows]
+        return [beat for part in self._parts(block) for beat in self._feed(part)]
 
     @property
     def usable(self) -> bool:
         """Whether some lead is connected, by the last sample; not 0.1 s after all fell silent."""
-        return bool(self._state.counters[at.USABLE])
+        return bool(np.asarray(self._state.now)["usable"][0])
 
-    def _feed(self, block: Float) -> Float:
-        feed(block, self._plan, self._state)
-        return np.asarray(self._state.found[: self._state.counters[at.FOUND]]).copy()
+    def _feed(self, block: Float) -> list[Beat]:
+        count = feed(block, self._plan, self._state)
+        return [self._beat(found) for found in _by_name(self._state.found, count)] if count else []
 
     def _parts(self, block: Float) -> Iterator[Float]:
         """Pieces short enough for the list of found beats."""
         step = int(_CHUNK_S * self._plan.rate_hz)
         return (block[start : start + step] for start in range(0, len(block), step))
 
-    def _beat(self, row: Float) -> Beat:
-        likeness = float(row[at.LIKENESS])
+    def _beat(self, found: Found) -> Beat:
+        likeness = float(found.likeness)
         strange = _is_strange(likeness, self._likenesses)
         self._likenesses.append(likeness)
         return Beat(
-            float(row[at.TIME]),
-            float(row[at.KNOWN] / self._plan.rate_hz),
-            int(row[at.LEAD]),
-            float(row[at.HEIGHT]),
-            likeness,
-            bool(row[at.LATE]),
-            strange,
-            bool(row[at.INSTEAD]),
+            time_s=float(found.time_s),
+            known_s=float(found.known_at / self._plan.rate_hz),
+            lead=int(found.lead),
+            height=float(found.height),
+            likeness=likeness,
+            late=bool(found.late),
+            strange=strange,
+            instead=bool(found.instead),
         )
 
 
@@ -210,26 +221,30 @@ def _plan(rate_hz: float) -> Plan:
 def _state(plan: Plan, leads: int) -> State:
     """Nothing seen yet."""
     even, odd = _wavelet(plan)
-    counters = np.zeros(at.COUNTERS, dtype=np.int64)
-    counters[at.LAST_BEAT] = -plan.length
-    counters[at.USABLE] = 1
-    numbers = np.zeros(at.NUMBERS)
-    numbers[[at.BEST, at.LAST_HEIGHT, at.BETWEEN, at.USUAL_RR]] = -1, 1, 0.1, plan.rate_hz
-    numbers[[at.LAST_LIKENESS, at.LAST_STEEP, at.LAST_TALL]] = 1
-    rows, shapes = np.zeros((leads, at.LEAD_FIELDS)), np.zeros((leads, at.SHAPE_POINTS))
-    intervals = np.zeros(at.KEPT_INTERVALS)
-    rows[:, [at.SMALLEST_STEP, at.LOWEST, at.LOWEST_OLD, at.LOWEST_OLDER, at.STILLEST]] = np.inf
-    return State(
-        even, odd, _bell(_COARSE_S, plan.rate_hz), _bell(_FINE_S, plan.rate_hz),
+    state = State(
+        even=even, odd=odd,
+        coarse=_bell(_COARSE_S, plan.rate_hz), fine=_bell(_FINE_S, plan.rate_hz),
         raw=np.zeros((leads, 2 * plan.length)), power=np.zeros((leads, 2 * plan.length)),
         energy=np.zeros((leads, plan.length)), fused=np.zeros(plan.length),
-        waves=np.zeros((at.KEPT_WAVES, 4)), intervals=intervals,
-        leads=rows, shapes=shapes, seen=np.zeros((leads, at.SHAPE_POINTS)),
-        found=np.zeros((64, at.FIELDS)), counters=counters, numbers=numbers,
-        before=at.Learnt(
-            rows.copy(), shapes.copy(), intervals.copy(), counters.copy(), numbers.copy()
-        ),
+        leads=records(Lead, leads), now=records(Now, 1),
+        waves=records(Wave, KEPT_WAVES), found=records(Found, KEPT_FOUND),
     )  # fmt: skip
+    for lead in _by_name(state.leads):
+        lead.smallest_step = lead.stillest = math.inf
+        lead.lowest = lead.lowest_old = lead.lowest_older = math.inf
+    for now in _by_name(state.now):
+        now.usable, now.best, now.between = True, -1.0, 0.1
+        for rhythm in (now.rhythm, now.before):
+            rhythm.last_at, rhythm.usual_rr = -plan.length, plan.rate_hz
+            rhythm.last_height = rhythm.last_likeness = 1.0
+            rhythm.last_tall = rhythm.last_steep = 1.0
+    return state
+
+
+def _by_name(kept: Sequence[Kind], count: int | None = None) -> Iterable[Kind]:
+    """Records whose fields have names in Python too; the compiler would take them too slowly."""
+    named: Iterable[Kind] = np.asarray(kept).view(np.recarray)[:count]
+    return named
 
 
 def _wavelet(plan: Plan) -> tuple[Float, Float]:

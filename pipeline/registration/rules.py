@@ -1,56 +1,61 @@
-"""Which waves count as beats: thresholds, the bar for T waves, and how tall and steep a wave is."""
+"""Which waves count as beats: not noise, not T waves, not P waves; and how tall and steep one is.
+
+Heights are energies in units of the usual beat's; thresholds are places between the level of what
+lies between beats (0) and that of beats (1).
+"""
 
 from __future__ import annotations
 
 import math
 
 from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import (
-    BEATS,
-    BETWEEN,
-    FOUND,
-    LAST_HEIGHT,
-    LAST_LIKENESS,
-    LEVEL,
-    LIKENESS,
-    STEEP,
-    STEEP_HERE,
-    STEEP_NOW,
-    TALL,
-    TALL_HERE,
-    TALL_NOW,
-    TOWERS,
-    USUAL_RR,
-    WEIGHT,
-    Plan,
-    State,
-)
+from pipeline.registration.detector_state import Plan, State
 from pipeline.registration.waves import ALIKE, measure_beat, smooth_window
 
+# A beat at all: is it higher than noise?
+THRESHOLD = 0.3
+"""A wave is a beat from this place on."""
+OVERDUE_SHARE = 0.5
+"""Where a beat is overdue it need be no higher than this share of it (Pan and Tompkins)."""
+
+# Not the T wave of the beat before?
 T_WAVE_S, USUAL_S = 0.36, 0.8
 """Until so long after a beat a wave of less than half its energy is that beat's T wave; where the
-usual RR interval is longer than so, later by its root (Bazett, Heart 7:353-370, 1920)."""
+usual RR interval is longer than the second, later by its root (Bazett, Heart 7:353-370, 1920)."""
 LATE_T_WAVE_S = 0.45
 """The same at most, and when a beat is overdue, for then the heart is slow."""
 FADE_S, LARGE = 0.15, 1.6
 """Beats of another shape, or so large, are wide or have large T waves: after them what a wave needs
-falls to nothing in so long, not at once."""
+falls to nothing in so long, not at once. No beat counts as larger for its T wave."""
 T_ENERGY, SHARP_ENERGY = 0.5, 0.3
 """Shares of a beat's energy under which a wave in that time is its T wave; the second, if the wave
 is as steep as so low a beat would be, which T waves are not (after Pan and Tompkins)."""
 DULL = 0.9
 """A wave is dull whose steepness, as a share of the usual beat's, is under this share of its
 height's: atrial waves and T waves. Low beats stay steep."""
-THRESHOLD = 0.3
-"""Place of the threshold between the levels of noise (0) and of beats (1)."""
-STRANGE_THRESHOLD, STRANGE_LATE = 0.36, 0.20
-"""The same for waves that do not look like the usual beat, P waves and noise among them; and where
-a beat is overdue."""
+
+# Not noise, and not of the atria?
 VERY_ALIKE = 0.9
-"""Correlation with the usual shape above which a low wave does look like the usual beat."""
+"""Correlation with the usual shape from which a low wave does look like the usual beat."""
+STRANGE_THRESHOLD, STRANGE_OVERDUE = 0.36, 0.20
+"""A wave that does not, P waves and noise among them, is a beat from this place on; and from the
+second where a beat is overdue."""
 SHORT, BLUNT, ATRIAL_THRESHOLD = 0.45, 0.7, 0.6
-"""But one under the first share of the usual beat's height, and under the second of the steepness
-that such a height should have, is an atrial wave up to the third place between the levels."""
+"""One that does, but is under the first share of the usual beat's height, and under the second of
+the steepness that such a height should have, is an atrial wave up to the third place."""
+
+# When a wave shows that the beat before it was its P wave.
+AHEAD_S, AHEAD = 0.25, 2.0
+"""A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
+ventricle beats twice in that time."""
+LONG_AHEAD_S = 0.32
+"""Up to so late, if it was duller for its height, too: PR intervals get so long."""
+LOW = 0.7
+"""Low is what has less than this share of a usual beat's energy."""
+OWN = 0.98
+"""Correlation from which a low wave is the heart's own beat, if it came when one was due: a tug at
+the electrode may follow it. P waves come too soon, and are 0.90 to 0.98 like beats."""
+
 FIRST_BEATS, TOWERING = 12, 1.9
 """Among so many first beats two of so much energy are the beats; the others were P waves of a heart
 that beats slower."""
@@ -59,78 +64,109 @@ SPAN_S, RISE_S = 0.060, 0.012
 
 
 @compiled
-def measure_stature(at: int, plan: Plan, s: State) -> None:
-    """How tall and steep the wave at a sample is, in shares of the usual beat's; 1 if unknown."""
-    tall, steep, weights = 0.0, 0.0, 0.0
-    for k in range(len(s.leads)):
-        lead = s.leads[k]
-        if lead[WEIGHT] <= 0.0:
-            continue
-        _measure(k, at, plan, s)
-        if lead[TALL] > 0.0 and lead[STEEP] > 0.0:
-            tall += lead[WEIGHT] * lead[TALL_HERE] / lead[TALL]
-            steep += lead[WEIGHT] * lead[STEEP_HERE] / lead[STEEP]
-            weights += lead[WEIGHT]
-    s.numbers[TALL_NOW] = tall / weights if weights > 0.0 else 1.0
-    s.numbers[STEEP_NOW] = steep / weights if weights > 0.0 else 1.0
-
-
-@compiled
-def is_beat(since_s: float, height: float, share: float, plan: Plan, s: State) -> bool:
-    """Whether a wave so long after a beat and so high exceeds a share of the threshold."""
-    between, last = s.numbers[BETWEEN], s.numbers[LAST_HEIGHT]
-    slow = math.sqrt(max(s.numbers[USUAL_RR] / (USUAL_S * plan.rate_hz), 1.0))
-    bar_s = LATE_T_WAVE_S if share < 1.0 else min(T_WAVE_S * slow, LATE_T_WAVE_S)
-    sharp = s.numbers[STEEP_NOW] >= DULL * s.numbers[TALL_NOW]
-    bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(last, LARGE)
-    if since_s >= bar_s:
-        wide = s.numbers[LAST_LIKENESS] < ALIKE or last > LARGE
-        bar *= 1.0 - (since_s - bar_s) / FADE_S if wide else 0.0
-    if height < bar:
+def is_beat(since_s: float, height: float, overdue: bool, plan: Plan, s: State) -> bool:
+    """Whether a wave so long after a beat is too high for noise and for that beat's T wave."""
+    if height < _t_wave_bar(since_s, overdue, plan, s):
         return False
-    return bool(height > between + share * THRESHOLD * (1.0 - between))
+    return _exceeds(height, OVERDUE_SHARE * THRESHOLD if overdue else THRESHOLD, s)
 
 
 @compiled
-def resembles(at: int, height: float, share: float, plan: Plan, s: State) -> bool:
+def resembles(at: int, height: float, overdue: bool, plan: Plan, s: State) -> bool:
     """Measure a wave that may be a beat: does it look like one, or is it high enough besides?"""
-    row, between = s.found[s.counters[FOUND]], s.numbers[BETWEEN]
-    measure_beat(at, row, plan, s)
-    strange = between + (STRANGE_THRESHOLD if share == 1.0 else STRANGE_LATE) * (1.0 - between)
-    if row[LIKENESS] < VERY_ALIKE:
-        return bool(height > strange)
-    atrial = s.numbers[TALL_NOW] < SHORT and s.numbers[STEEP_NOW] < BLUNT * s.numbers[TALL_NOW]
-    return bool(not atrial or height > between + ATRIAL_THRESHOLD * (1.0 - between))
+    now = s.now[0]
+    wave = s.found[now.found]
+    measure_beat(at, wave, plan, s)
+    if wave.likeness < VERY_ALIKE:
+        return _exceeds(height, STRANGE_OVERDUE if overdue else STRANGE_THRESHOLD, s)
+    atrial = now.tall < SHORT and now.steep < BLUNT * now.tall
+    return not atrial or _exceeds(height, ATRIAL_THRESHOLD, s)
+
+
+@compiled
+def _exceeds(height: float, place: float, s: State) -> bool:
+    """Whether a wave is higher than a place between the levels of noise (0) and of beats (1)."""
+    between = s.now[0].between
+    return height > between + place * (1.0 - between)
+
+
+@compiled
+def _t_wave_bar(since_s: float, overdue: bool, plan: Plan, s: State) -> float:
+    """Height that a wave so long after a beat needs to be none of its T wave."""
+    now, rhythm = s.now[0], s.now[0].rhythm
+    slow = math.sqrt(max(rhythm.usual_rr / (USUAL_S * plan.rate_hz), 1.0))
+    until_s = LATE_T_WAVE_S if overdue else min(T_WAVE_S * slow, LATE_T_WAVE_S)
+    sharp = now.steep >= DULL * now.tall
+    bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(rhythm.last_height, LARGE)
+    if since_s < until_s:
+        return bar
+    wide = rhythm.last_likeness < ALIKE or rhythm.last_height > LARGE
+    return bar * (1.0 - (since_s - until_s) / FADE_S) if wide else 0.0
+
+
+@compiled
+def last_may_be_p_wave(at: int, s: State) -> bool:
+    """Whether the last beat was low and did not, as the heart's own, come when one was due."""
+    rhythm, before = s.now[0].rhythm, s.now[0].before
+    due = before.last_at + before.usual_rr
+    own = rhythm.last_likeness >= OWN and abs(rhythm.last_at - due) < abs(at - due)
+    return rhythm.beats > 1 and rhythm.last_height < LOW and not own
+
+
+@compiled
+def outdoes_last(since_s: float, height: float, s: State) -> bool:
+    """Whether a wave is so much higher than the last beat, and sharper, as R is than P."""
+    rhythm, now = s.now[0].rhythm, s.now[0]
+    duller = rhythm.last_steep * now.tall < DULL * (rhythm.last_tall * now.steep)
+    return height > AHEAD * rhythm.last_height and (since_s < AHEAD_S or duller)
 
 
 @compiled
 def towers(height: float, s: State) -> bool:
     """Whether a beat is the second that shows all others so far to have been atrial waves."""
-    if height < TOWERING or s.counters[BEATS] > FIRST_BEATS:
+    if height < TOWERING or s.now[0].rhythm.beats > FIRST_BEATS:
         return False
-    s.counters[TOWERS] += 1
-    return bool(s.counters[TOWERS] == 2)
+    s.now[0].towers += 1
+    return s.now[0].towers == 2
+
+
+@compiled
+def measure_stature(at: int, plan: Plan, s: State) -> None:
+    """How tall and steep the wave at a sample is, in shares of the usual beat's; 1 if unknown."""
+    tall, steep, weights = 0.0, 0.0, 0.0
+    for k in range(len(s.leads)):
+        lead = s.leads[k]
+        weight, here, usual = lead.weight, lead.here, lead.usual
+        if weight <= 0.0:
+            continue
+        _measure(k, at, plan, s)
+        if usual.tall > 0.0 and usual.steep > 0.0:
+            tall += weight * here.tall / usual.tall
+            steep += weight * here.steep / usual.steep
+            weights += weight
+    s.now[0].tall = tall / weights if weights > 0.0 else 1.0
+    s.now[0].steep = steep / weights if weights > 0.0 else 1.0
 
 
 @compiled
 def learn_stature(first: int, last: int, plan: Plan, s: State) -> None:
     """First heights and steepnesses: those where a lead's energy is most like a beat's."""
     for k in range(len(s.leads)):
-        lead, best = s.leads[k], first
+        here, usual, best = s.leads[k].here, s.leads[k].usual, first
         for i in range(first, last + 1):
             energy, nearest = s.energy[k, i % plan.length], s.energy[k, best % plan.length]
-            if abs(energy - lead[LEVEL]) < abs(nearest - lead[LEVEL]):
+            if abs(energy - usual.level) < abs(nearest - usual.level):
                 best = i
         _measure(k, best, plan, s)
-        lead[TALL], lead[STEEP] = lead[TALL_HERE], lead[STEEP_HERE]
+        usual.tall, usual.steep = here.tall, here.steep
 
 
 @compiled
 def _measure(k: int, at: int, plan: Plan, s: State) -> None:
     """Height and steepness of one lead about a sample, in its own units."""
-    lead = s.leads[k]
+    here = s.leads[k].here
     span, rise = int(SPAN_S * plan.rate_hz), max(1, round(RISE_S * plan.rate_hz))
     window = smooth_window(s.raw[k], plan.length, at, span, span, s.fine)
-    lead[TALL_HERE], lead[STEEP_HERE] = window.max() - window.min(), 0.0
+    here.tall, here.steep = window.max() - window.min(), 0.0
     for i in range(rise, len(window)):
-        lead[STEEP_HERE] = max(lead[STEEP_HERE], abs(window[i] - window[i - rise]))
+        here.steep = max(here.steep, abs(window[i] - window[i - rise]))

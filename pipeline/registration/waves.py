@@ -12,32 +12,7 @@ import numpy as np
 
 from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import (
-    FINER,
-    HEIGHT_MV,
-    LEAD,
-    LEAN,
-    LEAN_NOW,
-    LIKENESS,
-    OFFSET,
-    PEAK,
-    SCATTER,
-    SHAPE_POINTS,
-    SHIFT,
-    SIGN,
-    STEEP,
-    STEEP_HERE,
-    STRANGE,
-    TALL,
-    TALL_HERE,
-    TIME,
-    TIMED,
-    WAY,
-    WEIGHT,
-    Plan,
-    State,
-)
-from pipeline.registration.detector_state import SIZE as SIZE_MV
+from pipeline.registration.detector_state import SHAPE_POINTS, Found, Here, Plan, State, Usual
 
 BEFORE_S, AFTER_S = 0.130, 0.100
 """Window about the middle of a QRS complex in which its main deflection is sought."""
@@ -55,10 +30,10 @@ FORGET_SHAPE = 8
 """After so many beats in succession of other shapes the last one is the usual one."""
 GROW, SHRINK = 0.3, 0.03
 """Shares by which usual height and steepness follow a beat that is taller or steeper, and less."""
-_OTHER_WAY = 0.13
+OTHER_WAY = 0.13
 """A deflection against a lead's usual direction is the main one of a beat of another shape if it is
 larger by this share of the sum of both."""
-_TURNED = 0.05
+TURNED = 0.05
 """The usual direction changes when on average the other one is larger by this share."""
 
 
@@ -94,10 +69,8 @@ def vertex(before: float, at: float, after: float) -> float:
 @compiled
 def above_rest(window: Float, before: int, rate_hz: float) -> Float:
     """The window less the line from before the QRS complex to after it: without drift."""
-    early, tail = (
-        max(1, before - int(REST_BEFORE_S * rate_hz)),
-        before + int(REST_AFTER_S * rate_hz),
-    )
+    early = max(1, before - int(REST_BEFORE_S * rate_hz))
+    tail = before + int(REST_AFTER_S * rate_hz)
     first, last = window[:early].mean(), window[tail:].mean()
     first_at, last_at = 0.5 * (early - 1), 0.5 * (tail + len(window) - 1)
     slope = (last - first) / (last_at - first_at)
@@ -161,91 +134,74 @@ def read_shape(
 
 
 @compiled
-def measure_beat(at: int, row: Float, plan: Plan, s: State) -> None:
+def measure_beat(at: int, wave: Found, plan: Plan, s: State) -> None:
     """Time R by all leads that show it, and compare its shape with the usual one."""
     likeness, weights, best = 0.0, 0.0, 0
     for k in range(len(s.leads)):
         lead = s.leads[k]
-        if lead[WEIGHT] <= 0.0:
+        weight, here, usual = lead.weight, lead.here, lead.usual
+        if weight <= 0.0:
             continue
-        lead[PEAK] = _time_lead(k, at, s.seen[k], plan, s)
-        if lead[TIMED] > 0.0:
-            likeness += lead[WEIGHT] * (s.seen[k] * s.shapes[k]).sum()
-            weights += lead[WEIGHT]
-        if lead[WEIGHT] > s.leads[best, WEIGHT]:
+        here.peak = _time_lead(k, at, plan, s)
+        if usual.timed > 0.0:
+            likeness += weight * (here.shape * usual.shape).sum()
+            weights += weight
+        if weight > s.leads[best].weight:
             best = k
-    likeness = likeness / weights if weights > 0.0 else 1.0
-    row[LEAD], row[LIKENESS] = best, likeness
-    row[TIME] = (at + _common_time(likeness >= ALIKE, s)) / plan.rate_hz
+    wave.lead, wave.likeness = best, likeness / weights if weights > 0.0 else 1.0
+    wave.time_s = (at + _common_time(wave.likeness >= ALIKE, s)) / plan.rate_hz
 
 
 @compiled
-def learn_beat(at: int, row: Float, anew: bool, plan: Plan, s: State) -> None:
-    """Let what is usual follow the beat that was measured last, or be that beat."""
-    if at < BEFORE_S * plan.rate_hz:
-        # The record began within this beat.
-        return
-    usual = row[LIKENESS] >= ALIKE
-    s.counters[STRANGE] = 0 if usual else s.counters[STRANGE] + 1
-    if anew or usual or s.counters[STRANGE] >= _patience(s):
-        _learn_shapes(row[TIME] * plan.rate_hz - at, anew or not usual, plan, s)
-
-
-@compiled
-def _patience(s: State) -> float:
-    """How many beats of other shapes make another shape the usual one: few, where few are known."""
-    return float(min(s.leads[:, TIMED].max() + 1.0, float(FORGET_SHAPE)))
-
-
-@compiled
-def _time_lead(k: int, at: int, shape: Float, plan: Plan, s: State) -> float:
+def _time_lead(k: int, at: int, plan: Plan, s: State) -> float:
     """When a lead's main deflection peaks, in samples after the complex's middle.
 
     A lead whose R and S are about as large keeps to the one it was timed by, as long as that looks
     as usual: they are some 20 to 30 ms apart.
     """
     lead, rate_hz = s.leads[k], plan.rate_hz
+    here, usual = lead.here, lead.usual
     around, before = int(SEARCH_S * rate_hz), int(BEFORE_S * rate_hz)
     window = smooth_window(s.raw[k], plan.length, at, before, int(AFTER_S * rate_hz), s.coarse)
     away = above_rest(window, before, rate_hz)[before - around : before + around + 1]
     bend = smooth_window(s.raw[k], plan.length, at, around, around, s.even)
     # Bends alone tell the main side, for what the scanner adds to the ST segment is smooth.
     rise, fall = max(bend[1:-1].max(), 0.0), max(-bend[1:-1].min(), 0.0)
-    lead[LEAN_NOW] = (rise - fall) / max(rise + fall, 1e-300)
-    if lead[TIMED] == 0.0:
-        lead[WAY] = 1.0 if rise >= fall else -1.0
-        lead[LEAN] = lead[LEAN_NOW]
-    lead[SIGN] = lead[WAY]
-    place = deflection(away, bend, lead[SIGN])
-    peak = _climb(k, at, place - around, shape, plan, s)
-    if lead[LEAN_NOW] * lead[WAY] < -_OTHER_WAY and (shape * s.shapes[k]).sum() < ALIKE:
-        lead[SIGN] = -lead[WAY]
-        place = deflection(away, bend, lead[SIGN])
-        peak = _climb(k, at, place - around, shape, plan, s)
-    return _refine(k, at, place - around, peak, abs(away[place]), plan, s)
+    here.lean = (rise - fall) / max(rise + fall, 1e-300)
+    if usual.timed == 0.0:
+        usual.way = 1.0 if rise >= fall else -1.0
+        usual.lean = here.lean
+    here.sign = usual.way
+    place, peak = _climb(k, at, away, bend, plan, s)
+    if here.lean * usual.way < -OTHER_WAY and (here.shape * usual.shape).sum() < ALIKE:
+        here.sign = -usual.way
+        place, peak = _climb(k, at, away, bend, plan, s)
+    return _refine(k, at, place, peak, abs(away[around + place]), plan, s)
 
 
 @compiled
-def _climb(k: int, at: int, place: int, shape: Float, plan: Plan, s: State) -> float:
-    """The summit near a sample, in samples after the complex's middle; and the shape about it."""
-    reach = max(1, int(CLIMB_S * plan.rate_hz))
-    sign = s.leads[k, SIGN]
-    peak = place + summit(s.raw[k], plan.length, at + place, sign, s.coarse, reach)
-    read_shape(s.raw[k], plan.length, at + peak, plan.rate_hz, s.even, shape)
-    return float(peak)
+def _climb(k: int, at: int, away: Float, bend: Float, plan: Plan, s: State) -> tuple[int, float]:
+    """The largest deflection to a lead's side, and the summit near it, in samples after the
+    complex's middle; and the shape about it."""
+    here, reach = s.leads[k].here, max(1, int(CLIMB_S * plan.rate_hz))
+    place = deflection(away, bend, here.sign) - len(away) // 2
+    peak = place + summit(s.raw[k], plan.length, at + place, here.sign, s.coarse, reach)
+    read_shape(s.raw[k], plan.length, at + peak, plan.rate_hz, s.even, here.shape)
+    return place, peak
 
 
 @compiled
 def _refine(k: int, at: int, place: int, peak: float, size: float, plan: Plan, s: State) -> float:
     """The peak with what smoothing moves it by, which is the same in every beat; noise is not."""
-    lead, rate_hz = s.leads[k], plan.rate_hz
-    reach = max(1, int(CLIMB_S * rate_hz))
-    finer = place - peak + summit(s.raw[k], plan.length, at + place, lead[SIGN], s.fine, reach)
-    if lead[SIGN] != lead[WAY]:
+    here, usual = s.leads[k].here, s.leads[k].usual
+    if here.sign != usual.way:
         return peak
-    lead[FINER], lead[HEIGHT_MV] = finer, size
-    shift, scatter = (lead[SHIFT], lead[SCATTER]) if lead[TIMED] > 0.0 else (finer, 0.0)
-    return float(peak + shift / (1.0 + (scatter / (0.001 * rate_hz)) ** 2))
+    reach = max(1, int(CLIMB_S * plan.rate_hz))
+    fine = summit(s.raw[k], plan.length, at + place, here.sign, s.fine, reach)
+    here.shift, here.size_mv = place - peak + fine, size
+    if usual.timed == 0.0:
+        return peak + here.shift
+    return peak + usual.shift / (1.0 + (usual.scatter / (0.001 * plan.rate_hz)) ** 2)
 
 
 @compiled
@@ -256,83 +212,106 @@ def _common_time(usual: bool, s: State) -> float:
     such offsets from beat to beat. A beat of another shape has others: there the earlier half of
     the leads decides.
     """
-    if not usual:
-        return _lower_median(s)
     total, weights = 0.0, 0.0
-    for k in range(len(s.leads)):
-        weight = s.leads[k, WEIGHT] if s.leads[k, TIMED] > 0.0 else 0.0
-        own = s.leads[k, PEAK] - s.leads[k, OFFSET]
-        if weight > 0.0:
-            total += weight * own
-            weights += weight
-    return float(total / weights) if weights > 0.0 else _lower_median(s)
+    for lead in s.leads:
+        if usual and lead.weight > 0.0 and lead.usual.timed > 0.0:
+            total += lead.weight * (lead.here.peak - lead.usual.offset)
+            weights += lead.weight
+    if weights > 0.0:
+        return total / weights
+    peaks, count = np.empty(len(s.leads)), 0
+    for lead in s.leads:
+        if lead.weight > 0.0:
+            peaks[count] = lead.here.peak
+            count += 1
+    return _lower_median(peaks[:count]) if count else 0.0
 
 
 @compiled
-def _lower_median(s: State) -> float:
-    alive = s.leads[s.leads[:, WEIGHT] > 0.0][:, PEAK]
-    if len(alive) == 0:
-        return 0.0
-    alive.sort()
-    return float(alive[(len(alive) - 1) // 2])
+def _lower_median(values: Float) -> float:
+    return float(np.sort(values)[(len(values) - 1) // 2])
+
+
+@compiled
+def learn_beat(at: int, wave: Found, anew: bool, plan: Plan, s: State) -> None:
+    """Let what is usual follow the beat that was measured last, or be that beat."""
+    if at < BEFORE_S * plan.rate_hz:
+        # The record began within this beat.
+        return
+    rhythm, usual = s.now[0].rhythm, wave.likeness >= ALIKE
+    rhythm.strange = 0 if usual else rhythm.strange + 1
+    if anew or usual or rhythm.strange >= _patience(s):
+        _learn_shapes(wave.time_s * plan.rate_hz - at, anew or not usual, plan, s)
+
+
+@compiled
+def _patience(s: State) -> float:
+    """How many beats of other shapes make another shape the usual one: few, where few are known."""
+    known = 0.0
+    for lead in s.leads:
+        known = max(known, lead.usual.timed)
+    return min(known + 1.0, float(FORGET_SHAPE))
 
 
 @compiled
 def _learn_shapes(together: float, anew: bool, plan: Plan, s: State) -> None:
     """Let the usual shape, direction and offset of every lead follow this beat, or be its own."""
-    for k in range(len(s.leads)):
-        lead = s.leads[k]
-        if lead[WEIGHT] <= 0.0:
+    for lead in s.leads:
+        here, usual = lead.here, lead.usual
+        if lead.weight <= 0.0:
             continue
         if anew:
-            lead[WAY], lead[LEAN], lead[TIMED] = lead[SIGN], lead[LEAN_NOW], 0.0
-        elif lead[SIGN] != lead[WAY]:
+            usual.way, usual.lean, usual.timed = here.sign, here.lean, 0.0
+        elif here.sign != usual.way:
             continue
-        _learn_size(lead, plan)
-        _learn_stature(lead, anew)
-        lead[TIMED] = min(lead[TIMED] + 1.0, 64.0)
-        share = max(1.0 / lead[TIMED], 0.02)
-        lead[LEAN] += share * (lead[LEAN_NOW] - lead[LEAN])
-        lead[OFFSET] += share * (lead[PEAK] - together - lead[OFFSET])
-        follow = max(1.0 / lead[TIMED], 0.1)
+        _learn_size(here, usual, plan.rate_hz)
+        usual.tall = _follow(usual.tall, here.tall, anew)
+        usual.steep = _follow(usual.steep, here.steep, anew)
+        usual.timed = min(usual.timed + 1.0, 64.0)
+        # A mean of all beats so far, later of the latest ones.
+        share, follow = max(1.0 / usual.timed, 0.02), max(1.0 / usual.timed, 0.1)
+        usual.lean += share * (here.lean - usual.lean)
+        usual.offset += share * (here.peak - together - usual.offset)
         for j in range(SHAPE_POINTS):
-            s.shapes[k, j] += follow * (s.seen[k, j] - s.shapes[k, j])
-        if lead[LEAN] * lead[WAY] < -_TURNED:
+            usual.shape[j] += follow * (here.shape[j] - usual.shape[j])
+        if usual.lean * usual.way < -TURNED:
             # From the next beat on this lead is timed by its other side.
-            lead[TIMED] = 0.0
-    s.counters[STRANGE] = 0
+            usual.timed = 0.0
+    s.now[0].rhythm.strange = 0
     _centre_offsets(s)
 
 
 @compiled
-def _learn_size(lead: Float, plan: Plan) -> None:
+def _learn_size(here: Here, usual: Usual, rate_hz: float) -> None:
     """How high beats are, and by how much smoothing moves their summit."""
-    if lead[TIMED] == 0.0:
-        lead[SHIFT], lead[SIZE_MV], lead[SCATTER] = lead[FINER], lead[HEIGHT_MV], 0.0
+    if usual.timed == 0.0:
+        usual.shift, usual.size_mv, usual.scatter = here.shift, here.size_mv, 0.0
         return
-    limit = 0.003 * plan.rate_hz
-    lead[SCATTER] += 0.1 * (min(abs(lead[FINER] - lead[SHIFT]), limit) - lead[SCATTER])
-    lead[SHIFT] += 0.1 * min(max(lead[FINER] - lead[SHIFT], -limit), limit)
-    lead[SIZE_MV] += 0.1 * (lead[HEIGHT_MV] - lead[SIZE_MV])
+    limit = 0.003 * rate_hz
+    usual.scatter += 0.1 * (min(abs(here.shift - usual.shift), limit) - usual.scatter)
+    usual.shift += 0.1 * min(max(here.shift - usual.shift, -limit), limit)
+    usual.size_mv += 0.1 * (here.size_mv - usual.size_mv)
 
 
 @compiled
-def _learn_stature(lead: Float, anew: bool) -> None:
-    """How tall and steep beats are; slowly downwards, for low waves may turn out to be none."""
-    for usual, here in ((TALL, TALL_HERE), (STEEP, STEEP_HERE)):
-        if anew or lead[usual] <= 0.0:
-            lead[usual] = lead[here]
-        else:
-            away = lead[here] - lead[usual]
-            lead[usual] += (GROW if away > 0.0 else SHRINK) * away
+def _follow(usual: float, here: float, anew: bool) -> float:
+    """A usual height or steepness after a beat; slowly downwards, for low waves may be none."""
+    if anew or usual <= 0.0:
+        return here
+    return usual + (GROW if here > usual else SHRINK) * (here - usual)
 
 
 @compiled
 def _centre_offsets(s: State) -> None:
     """Offsets are against the earlier half of the leads, for S follows R; on average, not once."""
-    timed = s.leads[s.leads[:, TIMED] > 0.0]
-    if len(timed) == 0:
+    offsets, count, fewest = np.empty(len(s.leads)), 0, np.inf
+    for lead in s.leads:
+        usual = lead.usual
+        if usual.timed > 0.0:
+            offsets[count], fewest = usual.offset, min(fewest, usual.timed)
+            count += 1
+    if count == 0:
         return
-    offsets = np.sort(timed[:, OFFSET])
-    middle = offsets[(len(offsets) - 1) // 2] * max(1.0 / timed[:, TIMED].min(), 0.1)
-    s.leads[:, OFFSET] -= middle
+    middle = _lower_median(offsets[:count]) * max(1.0 / fewest, 0.1)
+    for lead in s.leads:
+        lead.usual.offset -= middle
