@@ -85,15 +85,24 @@ def _figures(
             value = value.get(key) if isinstance(value, dict) else None
         return value if isinstance(value, float) else None
 
+    told, unregistered = remarks(stages), _unregistered(stages.get("register", {}))
+    if unregistered:
+        told = [("not registered", unregistered), *told]
     verdict = stages.get("register", {}).get("figures", {}).get("verdict", "")
     return (
         figure("surface", "lv_ejection_fraction"),
         figure("evaluate", "target_registration_error_mm"),
         figure("bake", "accuracy", "distance_error_max_mm"),
         figure("register", "expected_tre_mm"),
-        verdict,
-        "; ".join(f"{word}: {text}" for word, text in remarks(stages)),
+        "failed" if unregistered else verdict,
+        "; ".join(f"{word}: {text}" for word, text in told),
     )
+
+
+def _unregistered(register: Mapping[str, Any]) -> str:
+    """Why ultrasound was left out (``on_failure: mr_frame``); empty where there was none."""
+    cause = str(register.get("cause", "")) if register.get("status") == "skipped" else ""
+    return "" if cause.startswith("no tracked ultrasound") else cause
 
 
 def _images(record: Mapping[str, Any]) -> frozenset[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,9 @@ class Job:
 
     progress: Progress
     """Told how much is done, of how much."""
+
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    """Why a stage before this one made nothing, for a stage that repeats such reasons."""
 
     def product(self, stage: str) -> Path | None:
         """The folder of a finished stage, or None where it was skipped."""

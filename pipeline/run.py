@@ -49,6 +49,9 @@ class Stage:
     settings: tuple[str, ...] = ()
     """Sections of the settings it reads."""
 
+    repeats_reasons: bool = False
+    """Whether it tells why stages before it made nothing."""
+
 
 STAGES = (
     Stage("ingest", inputs=("cine", "mr_ecg")),
@@ -67,6 +70,7 @@ STAGES = (
         "report",
         after=("ingest", "segment", "surface", "register", "bake", "evaluate"),
         inputs=("us",),
+        repeats_reasons=True,
     ),
 )
 
@@ -261,7 +265,8 @@ def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
     for name in stage.after:
         require_unaltered(run.products / name)
     with publishing(target) as folder:
-        job = Job(run.study, run.settings, run.products, folder, run.watcher.progress)
+        told = run.watcher.progress, _reasons(run, stage)
+        job = Job(run.study, run.settings, run.products, folder, *told)
         figures: dict[str, Any] = module.run(job)
         _require_inputs_of_the_start(run, stage)
         seal(folder, key, figures)
@@ -282,6 +287,14 @@ def _require_inputs_of_the_start(run: _Run, stage: Stage) -> None:
             )
 
 
+def _reasons(run: _Run, stage: Stage) -> dict[str, str]:
+    """Why stages before this one made nothing, if it tells that."""
+    before = stage.after if stage.repeats_reasons else ()
+    entries = {name: run.stages.get(name) or _earlier(run, name) for name in before}
+    skipped = {name: one for name, one in entries.items() if one.get("status") == "skipped"}
+    return {name: str(one.get("cause")) for name, one in skipped.items()}
+
+
 def _fingerprint(run: _Run, stage: Stage) -> str:
     settings = run.settings.model_dump(mode="json", by_alias=True)
     before = {name: sealed(run.products / name) for name in stage.after}
@@ -296,6 +309,7 @@ def _fingerprint(run: _Run, stage: Stage) -> str:
             "before": {
                 name: one and (one["files"], one["figures"]) for name, one in before.items()
             },
+            "reasons": _reasons(run, stage),
             "code": code_digest(f"pipeline.stages.{stage.name}"),
             "libraries": library_versions(),
         }

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from batch_program import rows_of, stand_in
 
+from pipeline.batch_table import outcome_of
 from pipeline.cli import main
 
 # Stands in for the pipeline's own process: the patient's name says how its run ends.
@@ -86,3 +87,18 @@ def test_a_folder_that_is_no_study_is_listed_and_costs_nothing(
         "well": "done",
     }
     assert "neither cine/ nor study.yaml" in rows["cines"]["cause"]
+
+
+@pytest.mark.parametrize(
+    ("cause", "verdict"),
+    [
+        ("no tracked ultrasound: the field is in the frame of the MR", ""),
+        ("two poses agree alike; the field is in the frame of the MR", "failed"),
+    ],
+)
+def test_ultrasound_that_was_not_registered_is_told_from_none(cause: str, verdict: str) -> None:
+    """`on_failure: mr_frame`: the study is done, its registration is not."""
+    record = {"stages": {"register": {"status": "skipped", "cause": cause}}}
+    outcome = outcome_of("a", "done", "", "a", Path("a"), record=record).outcome
+    assert outcome.registration == verdict
+    assert outcome.remarks == (f"not registered: {cause}" if verdict else "")

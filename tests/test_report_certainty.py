@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 
 from pipeline.geometry import MovingSurface
-from pipeline.report.certainty import expected_error, seen_from
+from pipeline.report.certainty import LEAST_TOP_MM, expected_error, seen_from
 
 RADIUS_MM = 30.0
 
@@ -71,3 +71,9 @@ def test_colours_follow_the_expected_error_on_the_scale_that_is_drawn():
     label = figure.axes[-1].get_ylabel()
     assert label == "expected error (mm)"
     FigureCanvasAgg(figure).draw()
+
+
+def test_a_small_error_everywhere_has_not_the_colours_of_a_large_one():
+    figure = expected_error({"epicardium": ball()}, lambda points_mm: 0.4 + 0 * points_mm[:, 0])
+    painted = next(one for one in figure.axes[0].collections if isinstance(one, PolyCollection))
+    assert painted.get_clim() == (0, LEAST_TOP_MM)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
-from pipeline.report import slices
+from pipeline.report import pictures, slices
+from pipeline.report.animation import _webp, first_frame
 from pipeline.report.moments import Moments
-from pipeline.stages.report import _registration_notes
+from pipeline.report.page import Opening, Section, Table, render
+from pipeline.stages.report import _of_whole_ventricles, _opening, _registration_notes
 
 
 def notes(us: object, figures: dict[str, Any] | None) -> list[str]:
@@ -23,16 +28,16 @@ def notes(us: object, figures: dict[str, Any] | None) -> list[str]:
         study=SimpleNamespace(us=us),
         product=lambda stage: None if figures is None else Path("register"),
         figures=lambda stage: figures,
+        skipped={"register": "frames agree with nothing"},
     )
     return _registration_notes(cast(Job, job))
 
 
 def test_ultrasound_that_was_not_registered_is_not_called_missing() -> None:
     """`on_failure: mr_frame` goes on without it."""
-    assert notes(None, None) == ["No tracked ultrasound: the field is in the frame of the MR."]
+    assert notes(None, None) == []
     (told,) = notes(object(), None)
-    assert "could not be registered" in told
-    assert "frame of the MR" in told
+    assert told == "The tracked ultrasound could not be registered: frames agree with nothing."
 
 
 @pytest.mark.parametrize(
@@ -53,6 +58,67 @@ def test_doubts_and_corrections_stand_at_the_top(figures: dict[str, Any], told: 
     assert notes(object(), figures) == told
 
 
+def opening(us: object, verdict: str | None, doubtful: bool, truth: bool) -> Opening:
+    """Of a study whose other stages found nothing amiss, or a slice of low confidence."""
+    figures: dict[str, Any] = {
+        "segment": {"orientation": str(AS_THE_FILE_SAYS), "cut_off": {}},
+        "ingest": {"remarks": [], "interpolated_slices": [3] if doubtful else [], "phases": 9},
+        "surface": {"left_out": {}},
+        "bake": {"left_out": {}},
+        "register": {"verdict": verdict, "reason": "few frames", "remarks": []},
+    }
+    made = {"register": verdict is not None, "evaluate": truth}
+    job = SimpleNamespace(
+        study=SimpleNamespace(us=us),
+        product=lambda stage: Path(stage) if made[stage] else None,
+        figures=figures.__getitem__,
+        skipped={"register": "frames agree with nothing"},
+    )
+    return _opening(cast(Job, job))
+
+
+@pytest.mark.parametrize(
+    ("us", "verdict", "doubtful", "headline"),
+    [
+        (object(), "good", False, "Registration good. No warnings"),
+        (object(), "good", True, "Registration good. 1 warning, to be read first."),
+        (object(), "doubtful", True, "Registration doubtful. 2 warnings, to be read first."),
+        (object(), None, False, "NOT REGISTERED: not for use with a tracker;"),
+        (None, None, False, "Not registered: no tracked ultrasound,"),
+    ],
+)
+def test_the_page_begins_with_what_the_field_is_worth(
+    us: object, verdict: str | None, doubtful: bool, headline: str
+) -> None:
+    said = opening(us, verdict, doubtful, truth=True)
+    assert said.headline.startswith(headline)
+    assert any("not for use on patients" in text for text in said.told)
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_a_phantom_is_not_shown_as_a_patient(truth: bool) -> None:
+    told = " ".join(opening(None, None, False, truth).told)
+    assert ("synthetic" in told) is truth
+    assert ("No known truth" in told) is not truth
+
+
+def test_warnings_are_told_from_the_rest_by_words_and_not_by_colour_alone() -> None:
+    example = {"point_mm": [0, 0, 0], "phase": 0, "fixture": "a"}
+    page = render("p", [], [], example, Opening("Look.", ["it is <bad>"], ["it is so"]))
+    assert '<p class="verdict"><strong>Look.</strong></p>' in page
+    assert "<strong>Mind:</strong> it is &lt;bad&gt;</p>" in page
+    assert '<p class="told">it is so</p>' in page
+
+
+def test_tables_have_heads_that_a_screen_reader_can_tell() -> None:
+    example = {"point_mm": [0, 0, 0], "phase": 0, "fixture": "a"}
+    table = Table(("structure", ""), [("aorta", "3 mm")])
+    page = render("p", [("mass", "3 g")], [Section("s", "t", (), [table])], example, Opening("x"))
+    assert "<th>" not in page
+    for head in ('"col">structure', '"row">aorta', '"row">mass'):
+        assert f"<th scope={head}</th>" in page
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_the_page_says_how_the_stack_lies(turned: bool) -> None:
     """A radiologist must know which end is the apex, and which side of a picture is left."""
@@ -70,8 +136,35 @@ def test_the_page_says_how_the_stack_lies(turned: bool) -> None:
         labels[:, ::-1] if turned else labels,
         mr_from_index,
     )
+    axis = slices.contours(shown, 0).axes[0]
+    sides = {one.get_position(): one.get_text() for one in axis.texts}
+    assert sides == {(0.98, 0.5): "LS", (0.02, 0.5): "RI", (0.5, 0.02): "IL", (0.5, 0.98): "SR"}
     text = slices.how_it_lies(shown)
     assert text.startswith(f"Slice {4 if turned else 0} is the one nearest the apex. ")
     assert "Right in the pictures is LS, below IL, higher slice numbers P " in text
     labels[labels == LABELS["left_atrium"]] = 0
     assert slices.how_it_lies(replace(shown, labels=labels)).startswith("Right in the pictures")
+
+
+def test_the_animation_at_rest_is_one_picture() -> None:
+    frames = np.zeros((3, 20, 20, 3), np.uint8)
+    frames[0, ..., 0], frames[1, ..., 1], frames[2, ..., 2] = 255, 255, 255
+    still = Image.open(BytesIO(first_frame(_webp(frames, 0.8))))
+    assert getattr(still, "n_frames", 1) == 1
+    red, green, blue = np.asarray(still.convert("RGB")).mean(axis=(0, 1))
+    assert red > 200 > 60 > max(green, blue)
+
+
+def test_ultrasound_of_oblong_pixels_is_shown_in_proportion() -> None:
+    images = [np.zeros((8, 8), np.float32)] * 2
+    given = np.tile(np.eye(4), (2, 1, 1))
+    figure = pictures.cuts_on_ultrasound(images, ["a", "b"], given, np.zeros(2), {}, [1.0, 1.5])
+    assert [axis.get_aspect() for axis in figure.axes] == [1.0, 1.5]
+
+
+def test_figures_of_a_ventricle_that_the_stack_cuts_off_say_so() -> None:
+    rows = [("LV mass", "45 g"), ("RV ejection fraction", "57 %")]
+    assert _of_whole_ventricles(rows, {}) == rows
+    left, right = _of_whole_ventricles(rows, {"left ventricle": {0: 2}, "aorta": {7: 2}})
+    assert left == ("LV mass", "45 g (of what the stack shows)")
+    assert right == rows[1]

@@ -90,6 +90,16 @@ def framing(points_mm: Float) -> tuple[Float, float]:
     return np.asarray((low + high) / 2 @ axes), float(half_mm)
 
 
+def first_frame(animation: bytes) -> bytes:
+    """The animation at rest, as WebP."""
+    from PIL import Image
+
+    buffer = BytesIO()
+    with Image.open(BytesIO(animation)) as moving:
+        moving.convert("RGB").save(buffer, format="WEBP", quality=70)
+    return buffer.getvalue()
+
+
 def _webp(frames: Any, rr_s: float) -> bytes:
     from PIL import Image
 

@@ -16,6 +16,9 @@ from pipeline.report.colours import SOLID_COLOURS
 _LEAST_LIGHT = 0.7
 _VIEWS = (("from the front left", 1.0), ("from behind on the right", -1.0))
 
+# The scale reaches from 0 to this or beyond, so that a small error does not look like a large one.
+LEAST_TOP_MM = 2.0
+
 ErrorAt = Callable[[Float], Float]
 """``(n,)`` mm to be expected at ``(n, 3)`` points, LPS mm."""
 
@@ -34,7 +37,7 @@ def expected_error(surfaces: Mapping[str, MovingSurface], error_mm: ErrorAt) -> 
     for axis, (title, sign) in zip(figure.subplots(1, 2), _VIEWS, strict=True):
         facing, shape, light = seen_from(corners, sign * TOWARDS_VIEWER)
         painted = PolyCollection(list(shape), cmap="viridis", linewidths=0.3)
-        painted.set_clim(value.min(), max(value.max(), value.min() + 0.1))
+        painted.set_clim(0, max(float(value.max()), LEAST_TOP_MM))
         colours = painted.to_rgba(value[facing])
         colours[:, :3] *= light[:, None]
         painted.set(facecolors=colours, edgecolors=colours)

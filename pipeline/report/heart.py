@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.report import curves, slices
-from pipeline.report.animation import beating_surfaces
+from pipeline.report.animation import beating_surfaces, first_frame
 from pipeline.report.moments import Moments
 from pipeline.report.page import Picture, Section, Table, picture
 from pipeline.report.style import as_png, as_svg, as_webp
@@ -73,7 +73,7 @@ def movement(
             "One heartbeat, seen from the front left: left ventricle orange, right ventricle "
             "green, atria yellow (left) and pink, aorta blue"
         )
-        shown.append(picture(caption, animation, "webp"))
+        shown.append(picture(caption, animation, "webp", first_frame(animation)))
     volumes = as_svg(curves.volume_curves(phases, measures["volumes_ml"]))
     shown.append(picture("Volumes through the cycle", volumes, "svg"))
     shown += _muscle(phases, measures)

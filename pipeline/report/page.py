@@ -36,6 +36,9 @@ class Picture:
     source: str
     """A ``data:`` address."""
 
+    still: str = ""
+    """Of what moves: the same at rest, for readers who want nothing to move, and for paper."""
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -55,10 +58,27 @@ class Section:
     tables: Sequence[Table] = ()
 
 
-def picture(caption: str, content: bytes, kind: str) -> Picture:
-    """Embed an image; ``kind`` is png, svg or webp."""
-    coded = base64.b64encode(content).decode()
-    return Picture(caption, f"data:{MEDIA_TYPES[kind]};base64,{coded}")
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """What the page says before any figure."""
+
+    headline: str
+    """What the field may be taken for."""
+
+    warnings: Sequence[str] = ()
+    """What speaks against it."""
+
+    told: Sequence[str] = ()
+    """What is to be known, and speaks neither for nor against it."""
+
+
+def picture(caption: str, content: bytes, kind: str, still: bytes | None = None) -> Picture:
+    """Embed an image; ``kind``, which is that of ``still`` too, is png, svg or webp."""
+    return Picture(caption, _address(content, kind), _address(still, kind) if still else "")
+
+
+def _address(content: bytes, kind: str) -> str:
+    return f"data:{MEDIA_TYPES[kind]};base64,{base64.b64encode(content).decode()}"
 
 
 def is_single(value: object) -> bool:
@@ -69,7 +89,9 @@ def is_single(value: object) -> bool:
 def figure_row(name: str, value: object) -> tuple[str, str]:
     """A figure as people read it: ``drift_max_mm``, 0.0123 becomes drift max, 0.0123 mm."""
     ending = next((one for one in UNITS if name.endswith(one)), "")
-    text = f"{value:.3g}" if isinstance(value, float) else str(value)
+    text = str(value)
+    if isinstance(value, float):
+        text = f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
     words = name.removesuffix(ending).replace("_", " ")
     if value is None:
         return words, "unknown"
@@ -100,7 +122,7 @@ def render(
     summary: Sequence[tuple[str, str]],
     sections: Sequence[Section],
     example: Mapping[str, Any],
-    notes: Sequence[str] = (),
+    opening: Opening,
 ) -> str:
     """The page as HTML; text is escaped."""
     folder = Path(__file__).parent
@@ -110,7 +132,9 @@ def render(
         summary=summary,
         sections=sections,
         example=example,
-        notes=notes,
+        headline=opening.headline,
+        warnings=opening.warnings,
+        told=opening.told,
     )
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patheffects import Normal, Stroke
 
 from pipeline.field.fixture import Fixture
 from pipeline.field.potential import potential
@@ -24,6 +25,7 @@ from pipeline.geometry import (
 from pipeline.imaging.labels import LABELS
 from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
+from pipeline.report.slices import mark_sides
 from pipeline.report.style import handle, show_grey, words
 
 
@@ -55,6 +57,7 @@ def potential_on_slice(shown: Moments, field: ForceField, fixture: str) -> Figur
         show_grey(axis, shown.intensity[moment, number][window], shown.pixel_aspect)
         phase = float(shown.phases[moment])
         image = _draw_field(axis, field, fixture, points_mm, phase, shown.pixel_aspect)
+        mark_sides(axis, shown)
         axis.set_title(f"{name}, slice {number}: {words(fixture)}", fontsize=11)
     assert image is not None
     figure.colorbar(image, ax=list(axes), label="potential", shrink=0.8)
@@ -67,6 +70,7 @@ def cuts_on_ultrasound(
     image_from_mr: Float,
     phases: Float,
     surfaces: Mapping[str, MovingSurface],
+    aspects: Sequence[float],
 ) -> Figure:
     """Registered surfaces cut by the plane of each ultrasound frame.
 
@@ -80,12 +84,14 @@ def cuts_on_ultrasound(
         ``(frame, 4, 4)``: MR millimetres to ``(column, row, off-plane)``.
     phases
         ``(frame,)``.
+    aspects
+        One a frame: height of its pixels over their width.
     """
     figure = Figure(figsize=(3.2 * len(images), 2.9), layout="constrained")
     axes = figure.subplots(1, len(images), squeeze=False)[0]
-    frames = zip(axes, images, names, image_from_mr, phases, strict=True)
-    for axis, image, called, transform, phase in frames:
-        show_grey(axis, image)
+    frames = zip(axes, images, names, image_from_mr, phases, aspects, strict=True)
+    for axis, image, called, transform, phase, aspect in frames:
+        show_grey(axis, image, aspect)
         for name, (colour, style) in SURFACE_STYLES.items():
             if name not in surfaces:
                 continue
@@ -179,7 +185,9 @@ def _draw_field(
     rows, columns = np.mgrid[0 : shape[0] : step, 0 : shape[1] : step]
     arrows = axis.quiver(columns, rows, *in_plane, color="#56B4E9", width=0.004)
     most_n = field.fixtures[fixture].f_max_n
-    axis.quiverkey(arrows, 0.82, 0.04, most_n, f"{most_n:g} N", labelpos="E", labelcolor="w")
+    key = axis.quiverkey(arrows, 0.82, 0.04, most_n, f"{most_n:g} N", labelpos="E", color="w")
+    # Its label lies over arrows.
+    key.text.set(color="w", path_effects=[Stroke(linewidth=5, foreground="black"), Normal()])
     return image
 
 

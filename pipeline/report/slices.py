@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.geometry import Float, Integer, Label
@@ -28,6 +29,8 @@ MOST_NUMBERS = 60
 """A confidence map of no more cells has its numbers written in."""
 
 ALARM = "#C00000"
+
+_EDGES = (("left", "right"), ("bottom", "top"))
 
 
 class Doubt(NamedTuple):
@@ -71,6 +74,18 @@ def how_it_lies(shown: Moments) -> str:
     last = shown.labels.shape[1] - 1
     end = 0 if atrium > muscle else last
     return f"Slice {end} is the one nearest the apex. {text}" if atrium != muscle else text
+
+
+def mark_sides(axis: Axes, shown: Moments) -> None:
+    """Write at the four edges of a slice's picture where they lie in the patient, in LPS."""
+    right, down, _ = shown.mr_from_index[:3, :3].T
+    edge: list[AbstractPathEffect] = [Stroke(linewidth=2, foreground="black"), Normal()]
+    places = {(0.02, 0.5): -right, (0.98, 0.5): right, (0.5, 0.98): -down, (0.5, 0.02): down}
+    across, upright = ({0.02: low, 0.5: "center", 0.98: high} for low, high in _EDGES)
+    for (x, y), direction in places.items():
+        style: dict[str, Any] = {"ha": across[x], "va": upright[y], "path_effects": edge}
+        text = _letters(direction)
+        axis.text(x, y, text, transform=axis.transAxes, color="white", fontsize=8, **style)
 
 
 def _letters(direction: Float) -> str:
@@ -118,6 +133,8 @@ def contours(
         sure = None if confidence is None else float(confidence[moment, number])
         name = f"slice {number}" + (" (interpolated)" if number in shown.interpolated else "")
         _title(axis, name, sure, low)
+    # One is enough: all slices of a stack lie alike.
+    mark_sides(axes[0], shown)
     _legend(figure)
     return figure
 

@@ -53,6 +53,8 @@ def run(job: Job) -> dict[str, Any]:
         "verdict": found.verdict,
         "reason": found.reason,
         "expected_tre_mm": round(found.expected_mm, 3),
+        "good_tre_mm": job.settings.register_.good_tre_mm,
+        "worst_tre_mm": job.settings.register_.worst_tre_mm,
         "chance_under_2_mm": round(found.chance_under_2_mm, 3),
         "breath_range_mm": round(float(np.ptp(found.breath_mm)), 2),
         "calibration": "; ".join(one.words() for one in found.corrections),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from pipeline.registration.correction import put_right
 from pipeline.registration.uncertainty import expected_tre_mm
 from pipeline.report import certainty, certificate, heart, pictures
 from pipeline.report.moments import Moments
-from pipeline.report.page import Section, Table, flat_table, picture, render
+from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
 from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts
@@ -49,7 +50,7 @@ def run(job: Job) -> dict[str, Any]:
         _summary(job, measures, confidence),
         sections,
         job.figures("bake")["example"],
-        _notes(job),
+        _opening(job),
     )
     (job.folder / "index.html").write_text(page, encoding="utf-8", errors="backslashreplace")
     return {"pictures": sum(len(section.pictures) for section in sections)}
@@ -85,8 +86,11 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
             f"{ingest['slices']} slices, {ingest['phases']} phases, {ingest['timing_source']}",
         ),
         ("heart rate", f"{60 / ingest['rr_s']:.0f} beats/min"),
-        *heart.function_rows(measures),
-        ("lowest confidence of the labels", lowest_place(confidence)),
+        *_of_whole_ventricles(heart.function_rows(measures), job.figures("segment")["cut_off"]),
+        (
+            "lowest confidence of the labels",
+            f"{lowest_place(confidence)}; doubtful below {LOW_CONFIDENCE:.2f}",
+        ),
     ]
     if job.product("register"):
         register = job.figures("register")
@@ -94,14 +98,47 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
         said = [register["verdict"], register["reason"], register["calibration"]]
         rows.append(("registration", "; ".join(filter(None, said))))
         expected_mm, chance = register["expected_tre_mm"], register["chance_under_2_mm"]
-        worth = f"{expected_mm:.1f} mm; under 2 mm with a chance of {chance:.0%}"
+        worth = f"{expected_mm:.2f} mm, good is up to {register['good_tre_mm']:g} mm, of use up to "
+        worth += f"{register['worst_tre_mm']:g} mm; under 2 mm with a chance of {chance:.0%}"
         rows.append(("expected registration error over the heart", worth))
     off_mm = accuracy["surface_error_p99_mm"]
     rows.append(("error of the field on the surface, 99 places in 100", f"{off_mm:.2f} mm"))
     return rows
 
 
-def _notes(job: Job) -> list[str]:
+def _of_whole_ventricles(
+    rows: list[tuple[str, str]], cut_off: Mapping[str, Any]
+) -> list[tuple[str, str]]:
+    """The figures of function, with a word beside those of a ventricle that the stack cuts off."""
+    cut = {name for name in ("left", "right") if f"{name} ventricle" in cut_off}
+    short = tuple({"left": "LV", "right": "RV"}[name] for name in cut)
+    return [
+        (name, f"{text} (of what the stack shows)" if name.startswith(short) else text)
+        for name, text in rows
+    ]
+
+
+def _opening(job: Job) -> Opening:
+    """Whether the field may be used, as far as the program can tell, and why not."""
+    warnings = _warnings(job)
+    where = "Not registered: no tracked ultrasound, so a field in the frame of the MR alone."
+    if job.product("register"):
+        where = f"Registration {job.figures('register')['verdict']}."
+    elif job.study.us is not None:
+        where = "NOT REGISTERED: not for use with a tracker; a field in the frame of the MR alone."
+    many = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
+    found = f"{many}, to be read first." if warnings else "No warnings from the program's checks."
+    told = ["Research software: not a medical device, and not for use on patients."]
+    if job.product("evaluate"):
+        told.append(
+            "This study has a known truth (the last section): it is synthetic, not a patient's."
+        )
+    else:
+        told.append("No known truth in this study: accuracy against truth was not measured.")
+    return Opening(f"{where} {found}", warnings, told)
+
+
+def _warnings(job: Job) -> list[str]:
     notes = []
     orientation = job.figures("segment")["orientation"]
     if orientation != str(AS_THE_FILE_SAYS):
@@ -125,20 +162,15 @@ def _notes(job: Job) -> list[str]:
     for name, why in job.figures("bake")["left_out"].items():
         notes.append(f"Left out: the default fixture {name}, which {why}.")
     notes += _registration_notes(job)
-    if not job.product("evaluate"):
-        notes.append("No known truth in this study: accuracy against truth was not measured.")
     return notes
 
 
 def _registration_notes(job: Job) -> list[str]:
     """What to mind of the ultrasound, before anything is looked at."""
     if job.study.us is None:
-        return ["No tracked ultrasound: the field is in the frame of the MR."]
+        return []
     if not job.product("register"):
-        return [
-            "The tracked ultrasound could not be registered, for the reason in run.json under "
-            "register: the field is in the frame of the MR."
-        ]
+        return [f"The tracked ultrasound could not be registered: {job.skipped['register']}."]
     figures = job.figures("register")
     notes = [f"Clocks: {text}." for text in clock_put_right(figures)]
     if figures["verdict"] != "good":
@@ -170,8 +202,14 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
         ]
     )
     names = [f"{row.sweep}, frame {row.frame}" for row in chosen]
+    size = [np.linalg.norm(one[:3, :2], axis=0) for one in np.linalg.inv(image_from_mr)]
     figure = pictures.cuts_on_ultrasound(
-        images, names, image_from_mr, np.array([row.phase for row in chosen]), surfaces
+        images,
+        names,
+        image_from_mr,
+        np.array([row.phase for row in chosen]),
+        surfaces,
+        [float(high / wide) for wide, high in size],
     )
     heart_in_mm = certainty.expected_error(
         surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
