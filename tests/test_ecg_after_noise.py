@@ -75,6 +75,19 @@ def test_no_beats_are_found_where_only_noise_is_left_after_cautery(rate_hz):
     assert not [beat for beat in found if beat.time_s > 34.0]
 
 
+@pytest.mark.parametrize("rate_hz", [100.0, 500.0])
+def test_a_heart_that_stops_under_bursts_of_muscle_noise_has_no_beats(rate_hz):
+    drawn = record("normal", seed=5, duration_s=80.0, rate_hz=rate_hz)
+    rng, count = np.random.default_rng(3), len(drawn.signal_mv)
+    knots = np.arange(0, count, 0.3 * rate_hz)
+    bursts = np.exp(0.8 * np.interp(np.arange(count), knots, rng.normal(size=len(knots))))
+    signal_mv = drawn.signal_mv.copy()
+    signal_mv[int(40.0 * rate_hz) :] = 0.0
+    signal_mv += 0.015 * bursts[:, None] * rng.normal(size=signal_mv.shape)
+    found = RPeakDetector(rate_hz, signal_mv.shape[1]).push(signal_mv)
+    assert not [beat for beat in found if beat.time_s > 41.0]
+
+
 @pytest.mark.parametrize("what", ["noise", "hum"])
 def test_a_stream_that_begins_in_noise_finds_beats_when_it_ends(what):
     drawn = record("normal", seed=4, duration_s=60.0, rate_hz=RATE_HZ)

@@ -11,15 +11,19 @@ REFRACTORY_S = 0.20
 """No two beats are closer together."""
 LONE = 0.5
 """A wave stands out alone where the next lower one has less than so much of its energy."""
+EVEN = 0.85
+"""Waves are even where nine in ten have so much of the energy of beats."""
 LEAST_NOISE = 0.02
 """No lead has less energy than this share of its beats' between them; a silent one would weigh all.
 """
 
 
 @compiled
-def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[float, float, bool]:
-    """Energy of a lead's beats and of what lies between them, from a stretch of samples; and
-    whether one wave alone stands out.
+def wave_levels(
+    k: int, first: int, last: int, plan: Plan, s: State
+) -> tuple[float, float, bool, bool]:
+    """Energy of a lead's beats and of what lies between them, from a stretch of samples; whether
+    one wave alone stands out, and whether all are even.
 
     Beats are the highest waves; the one highest of all may be a tug at the electrode, or the only
     beat that a slow heart has had in that time, between its atrial waves.
@@ -37,11 +41,13 @@ def wave_levels(k: int, first: int, last: int, plan: Plan, s: State) -> tuple[fl
             best, best_at = 0.0, i
     seen.sort()
     if count == 0:
-        return 0.8 * seen[-1], seen[int(0.7 * len(seen))], False
+        return 0.8 * seen[-1], seen[int(0.7 * len(seen))], False, False
     found = np.sort(waves[:count])
     lone = count > 1 and found[-2] < LONE * found[-1]
     high = found[found > 0.4 * found[max(0, count - 2)]]
-    return 0.9 * high[len(high) // 2], seen[int(0.7 * len(seen))], lone
+    level = 0.9 * high[len(high) // 2]
+    even = found[count // 10] >= EVEN * level
+    return level, seen[int(0.7 * len(seen))], lone, even
 
 
 @compiled

@@ -69,7 +69,8 @@ CLEAR, UNCLEAR = 3.5, 2.0
 """Beats have at least so many times the energy of what lies between them where they are plain to
 see; waves that have less than so many times are none, or not all of them."""
 RACING = 1.65
-"""The same of a heart at 200 a minute, which hardly rests; noise of any colour reaches 1.55."""
+"""The same of a heart at 200 a minute, which hardly rests; noise of any colour reaches 1.55, and
+more only where it comes in bursts, whose waves are not even."""
 MOST_S, LOOK_S = 6.0, 0.25
 """Where no beat is plain to see after ``LEARN_S`` it is looked for this long, this often."""
 RECENT_S = 4.0
@@ -156,7 +157,7 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
     first = max(0, middle - plan.length + 4 * plan.half)
     clear, highest = False, 0.0
     for k in range(len(s.leads)):
-        level, noise, lone = wave_levels(k, first, middle, plan, s)
+        level, noise, lone, _ = wave_levels(k, first, middle, plan, s)
         s.leads[k].usual.level, s.leads[k].noise = level, max(noise, LEAST_NOISE * level)
         clear = clear or (level > CLEAR * noise and not lone)
         highest = max(highest, level)
@@ -285,8 +286,8 @@ def _look_back(i: int, plan: Plan, s: State) -> None:
     silent_s = (i - max(rhythm.last_at, now.learn_at)) / rate_hz
     if silent_s > max(SILENCE_S, SILENCE * rhythm.usual_rr / rate_hz):
         first = rhythm.last_at + int(LATE_T_WAVE_S * rate_hz)
-        bar = RACING if i - rhythm.last_at > MOST_S * rate_hz else CLEAR
-        _learn_again(first, i - int(PATIENCE_S * rate_hz), bar, plan, s)
+        racing = i - rhythm.last_at > MOST_S * rate_hz
+        _learn_again(first, i - int(PATIENCE_S * rate_hz), racing, plan, s)
 
 
 @compiled
@@ -308,12 +309,12 @@ def _highest_kept(i: int, plan: Plan, s: State) -> int:
 
 
 @compiled
-def _learn_again(first: int, last: int, bar: float, plan: Plan, s: State) -> None:
+def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> None:
     """Beats may have become smaller, or what was taken for beats was none: new levels.
 
-    They are learnt from leads whose waves have more than ``bar`` times the energy of what lies
-    between them. Levels fall at once if the highest wave looks like a usual beat, and slowly if it
-    does not: it may be a P wave that no beat follows.
+    They are learnt where beats are plain to see, or even waves look like those of a ``racing``
+    heart. Levels fall at once if the highest wave looks like a usual beat, and slowly if it does
+    not: it may be a P wave that no beat follows.
     """
     s.now[0].learn_at = s.now[0].seen
     first = max(first, last - plan.length + 4 * plan.half, 0)
@@ -329,8 +330,8 @@ def _learn_again(first: int, last: int, bar: float, plan: Plan, s: State) -> Non
         # A lead that is off says nothing about how large its beats are.
         if lead.weight <= 0.0:
             continue
-        level, noise, _ = wave_levels(k, first, last, plan, s)
-        if level > bar * noise:
+        level, noise, _, even = wave_levels(k, first, last, plan, s)
+        if level > (RACING if racing and even else CLEAR) * noise:
             level = max(level, least * usual.level)
             change = level / usual.level if usual.level > 0.0 else 0.0
             usual.tall *= change
@@ -364,7 +365,7 @@ def _accept(at: int, height: float, late: bool, instead: bool, plan: Plan, s: St
     learn_beat(at, wave, anew, plan, s)
     now.found += 1
     if contrast < UNCLEAR and at - now.learn_at > RECENT_S * plan.rate_hz:
-        _learn_again(at - int(RECENT_S * plan.rate_hz), at, CLEAR, plan, s)
+        _learn_again(at - int(RECENT_S * plan.rate_hz), at, False, plan, s)
 
 
 @compiled
