@@ -190,7 +190,7 @@ def test_an_out_whose_name_is_too_long_is_refused(tmp_path: Path) -> None:
 
 def test_a_sweeps_name_is_no_formula() -> None:
     figure = pictures.cuts_on_ultrasound(
-        [np.zeros((4, 4))], ["a$\\frac{$, frame 3"], np.eye(4)[None], np.zeros(1), {}, [1.0]
+        [np.zeros((4, 4))], ["a$\\frac{$, frame 3"], np.eye(4)[None], np.zeros(1), {}
     )
     figure.savefig(io.BytesIO())
     assert figure.axes[0].get_title() == "a$\\frac{$, frame 3, phase 0.00"

@@ -157,8 +157,9 @@ def test_the_animation_at_rest_is_one_picture() -> None:
 
 def test_ultrasound_of_oblong_pixels_is_shown_in_proportion() -> None:
     images = [np.zeros((8, 8), np.float32)] * 2
-    given = np.tile(np.eye(4), (2, 1, 1))
-    figure = pictures.cuts_on_ultrasound(images, ["a", "b"], given, np.zeros(2), {}, [1.0, 1.5])
+    # Pixels of 1 x 1 mm, and of 2 mm across and 3 mm down.
+    given = np.stack([np.eye(4), np.diag([1 / 2, 1 / 3, 1, 1])])
+    figure = pictures.cuts_on_ultrasound(images, ["a", "b"], given, np.zeros(2), {})
     assert [axis.get_aspect() for axis in figure.axes] == [1.0, 1.5]
 
 

@@ -70,7 +70,6 @@ def cuts_on_ultrasound(
     image_from_mr: Float,
     phases: Float,
     surfaces: Mapping[str, MovingSurface],
-    aspects: Sequence[float],
 ) -> Figure:
     """Registered surfaces cut by the plane of each ultrasound frame.
 
@@ -84,14 +83,13 @@ def cuts_on_ultrasound(
         ``(frame, 4, 4)``: MR millimetres to ``(column, row, off-plane)``.
     phases
         ``(frame,)``.
-    aspects
-        One a frame: height of its pixels over their width.
     """
     figure = Figure(figsize=(3.2 * len(images), 2.9), layout="constrained")
     axes = figure.subplots(1, len(images), squeeze=False)[0]
-    frames = zip(axes, images, names, image_from_mr, phases, aspects, strict=True)
-    for axis, image, called, transform, phase, aspect in frames:
-        show_grey(axis, image, aspect)
+    frames = zip(axes, images, names, image_from_mr, phases, strict=True)
+    for axis, image, called, transform, phase in frames:
+        wide_mm, high_mm = np.linalg.norm(np.linalg.inv(transform)[:3, :2], axis=0)
+        show_grey(axis, image, float(high_mm / wide_mm))
         for name, (colour, style) in SURFACE_STYLES.items():
             if name not in surfaces:
                 continue

@@ -202,15 +202,8 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
         ]
     )
     names = [f"{row.sweep}, frame {row.frame}" for row in chosen]
-    size = [np.linalg.norm(one[:3, :2], axis=0) for one in np.linalg.inv(image_from_mr)]
-    figure = pictures.cuts_on_ultrasound(
-        images,
-        names,
-        image_from_mr,
-        np.array([row.phase for row in chosen]),
-        surfaces,
-        [float(high / wide) for wide, high in size],
-    )
+    phases = np.array([row.phase for row in chosen])
+    figure = pictures.cuts_on_ultrasound(images, names, image_from_mr, phases, surfaces)
     heart_in_mm = certainty.expected_error(
         surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
     )
