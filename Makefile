@@ -73,7 +73,7 @@ NO_ENDS := --without ends $(NO_ILL)
 NO_BASE := --without base $(NO_ENDS)
 NO_FINE := --without fine $(NO_BASE)
 
-train: setup ## make the segmentation weights anew from the phantom (seven hours; needs PyTorch)
+train: setup ## make both networks' weights anew from the phantom (eight hours; needs PyTorch)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
 	$(TRAIN) --out training --without rims --without bare $(NO_FINE)
 	$(TRAIN) --out training/second $(NO_FINE) --start training/heart.pt \
@@ -103,6 +103,8 @@ train: setup ## make the segmentation weights anew from the phantom (seven hours
 		--start training/tenth/heart.pt --learning-rate 7e-4 --steps 7500 \
 		--halfway-from training/tenth/heart.pt
 	cp training/eleventh/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound
+	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 
 $(STAGES): setup
 	$(BIN)/beatfield $@ "$$STUDY" --out "$$OUT" --config "$$CONFIG"

@@ -42,6 +42,7 @@ from pipeline.geometry import Float, MovingSurface, transform_points
 from pipeline.products import read_table
 from pipeline.registration.clock_offset import Timing, estimate_offset
 from pipeline.registration.frames import DisplacedSweep
+from pipeline.registration.reading import as_compared
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.time import detect_r_peaks
@@ -86,7 +87,7 @@ def measured(settings: PhantomSettings, surfaces: str) -> dict[str, Any]:
     begun_s = time.process_time()
     options = RegisterSettings()
     search = prepare_search(timing.phases(), model, start, options)
-    sweeps = [_as_read(one) for one in recorded]
+    sweeps = as_compared([_as_read(one) for one in recorded], options)
     best = search.best(sweeps)
     searched_s = time.process_time()
     level = search.fine_level(sweeps).thinned(options.max_frames)

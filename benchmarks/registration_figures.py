@@ -2,7 +2,7 @@
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--peer 20]
-        [--global 0] [--calibration-error MM DEG] [--mr-pixels 1]
+        [--global 0] [--calibration-error MM DEG] [--mr-pixels 1] [--reading network|grey]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
@@ -206,7 +206,8 @@ def result_of(
             assert cine is not None, "--mr-pixels needs --surfaces PRODUCTS, which have a cine"
             study, surfaces, cine = with_pixels_wrong(study, surfaces, cine, arguments.mr_pixels)
         known = None if method == "global" else guess
-        settings = RegisterSettings(calibration="per_sweep" if method == "per_sweep" else "fixed")
+        corrected = "per_sweep" if method == "per_sweep" else "fixed"
+        settings = RegisterSettings(calibration=corrected, reading=arguments.reading)
         measured = registered(study, surfaces, cine, known, settings)
     about = {"study": order.name, "method": method, "start": start, "share": share}
     keys = ("probe", "frames", "dropout", "snr_db", "pathology")
@@ -388,6 +389,7 @@ def main() -> None:
     parser.add_argument("--peer", type=int, default=20)
     parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
     parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")
+    parser.add_argument("--reading", choices=["network", "grey"], default="network")
     parser.add_argument("--global", dest="without_start", type=int, default=0)
     print(tables(work(parser.parse_args())))
 

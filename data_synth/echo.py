@@ -81,9 +81,23 @@ def _table(values: list[float]) -> Float:
     return table
 
 
-_SCATTER = 10 ** (_table([a.scatter_db for a in ACOUSTICS.values()]) / 20)
-_IMPEDANCE = _table([a.impedance_mrayl for a in ACOUSTICS.values()])
-_ATTENUATION = _table([a.attenuation_db_per_cm for a in ACOUSTICS.values()])
+@dataclass(frozen=True, slots=True, eq=False)
+class Echoes:
+    """What sound meets in every tissue: `ACOUSTICS` as ``(tissues,)`` arrays by tissue number."""
+
+    scatter: Float
+    """Amplitude of speckle over that of heart muscle."""
+
+    impedance_mrayl: Float
+    attenuation_db_per_cm: Float
+
+
+ECHOES = Echoes(
+    10 ** (_table([a.scatter_db for a in ACOUSTICS.values()]) / 20),
+    _table([a.impedance_mrayl for a in ACOUSTICS.values()]),
+    _table([a.attenuation_db_per_cm for a in ACOUSTICS.values()]),
+)
+"""Of the tissues as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +192,7 @@ def bmode(
     contact_db: Float,
     optics: Optics,
     scatterers: Complex | None = None,
+    echoes: Echoes = ECHOES,
 ) -> Byte:
     """The picture of the tissues ``labels`` (``(ranges, beams)``) as a scanner shows it.
 
@@ -188,6 +203,8 @@ def bmode(
     scatterers
         ``(ranges, beams)`` complex echoes of unit mean power after :func:`point_spread`; fresh
         ones, independent of any other picture, if None.
+    echoes
+        What sound meets in the tissues.
 
     Returns
     -------
@@ -195,7 +212,7 @@ def bmode(
     """
     if scatterers is None:
         scatterers = unit_noise(rng, labels.shape)
-    lines = received(rng, labels, sector, contact_db, optics, scatterers)
+    lines = received(rng, labels, sector, contact_db, optics, scatterers, echoes)
     return sector.draw(compressed(lines, sector, optics))
 
 
@@ -217,10 +234,12 @@ def received(
     contact_db: Float,
     optics: Optics,
     scatterers: Complex,
+    echoes: Echoes = ECHOES,
 ) -> Complex:
     """What the array hears, ``(ranges, beams)``, before any amplifier; muscle at the tip is 1."""
-    echo = _SCATTER[labels] * scatterers + _specular(labels, sector, scatterers)
-    loss_db = path_loss_db(labels, sector, optics)
+    log_impedance = np.log(echoes.impedance_mrayl)[labels]
+    echo = echoes.scatter[labels] * scatterers + _specular(log_impedance, sector, scatterers)
+    loss_db = path_loss_db(labels, sector, optics, echoes)
     echo = echo * 10 ** ((contact_db - loss_db) / 20)
     echo = point_spread(echo, sector, optics)
     echo += _reverberation(echo, sector)
@@ -241,15 +260,16 @@ def unit_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Complex:
     return np.asarray(real + 1j * imaginary)
 
 
-def path_loss_db(labels: npt.NDArray[np.uint8], sector: Sector, optics: Optics) -> Float:
+def path_loss_db(
+    labels: npt.NDArray[np.uint8], sector: Sector, optics: Optics, echoes: Echoes = ECHOES
+) -> Float:
     """``(ranges, beams)`` loss on the way there and back."""
-    each = 2 * optics.loss_scale * _ATTENUATION[labels]
+    each = 2 * optics.loss_scale * echoes.attenuation_db_per_cm[labels]
     return np.asarray(np.cumsum(each, axis=0) * sector.range_step_mm / 10)
 
 
-def _specular(labels: npt.NDArray[np.uint8], sector: Sector, scatterers: Complex) -> Complex:
+def _specular(log_impedance: Float, sector: Sector, scatterers: Complex) -> Complex:
     """Echoes of interfaces: reflection coefficient per mm, times how squarely the beam hits."""
-    log_impedance = np.log(_IMPEDANCE)[labels]
     beam_step_rad = sector.angles_rad[1] - sector.angles_rad[0]
     smooth = gaussian_filter(log_impedance, (0.7 / sector.range_step_mm, 1.0), mode="nearest")
     along = np.gradient(smooth, sector.range_step_mm, axis=0)

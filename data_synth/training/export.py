@@ -1,4 +1,4 @@
-"""Write the network as ONNX, node by node: the same weights always give the same bytes."""
+"""Write a network as ONNX, node by node: the same weights always give the same bytes."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from data_synth.training.contrast import CLASSES
-from data_synth.training.network import PLANES, HeartNet
+from data_synth.training.network import UNet
 
 Float32 = npt.NDArray[np.float32]
 
 OPSET = 13
 
 
-def write_onnx(path: Path, network: HeartNet) -> None:
+def write_onnx(path: Path, network: UNet) -> None:
     """Write ``network`` as it works after training: batch normalisation folded into weights.
 
-    Input ``images`` is ``(n, 3, row, column)`` float32 with sides that divide by 16; output
-    ``scores`` is ``(n, 3 * 7, row, column)``, plane by plane, before softmax.
+    Input ``images`` is ``(n, channels, row, column)`` float32 with sides that divide by 16; output
+    ``scores`` is ``(n, scores, row, column)``, before softmax. The graph is named like the file.
     """
     graph = _Graph()
     name, skips = "images", []
@@ -38,7 +37,9 @@ def write_onnx(path: Path, network: HeartNet) -> None:
         name = graph.blocks(graph.add("Add", [name, skips.pop()]), block)
     graph.convolution(name, *_arrays(network.head), output="scores")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(graph.model().SerializeToString(deterministic=True))
+    channels, scores = network.down[0][0][0].in_channels, network.head.out_channels
+    model = graph.model(path.stem, channels, scores)
+    path.write_bytes(model.SerializeToString(deterministic=True))
 
 
 _TWICE = np.array([1, 1, 2, 2], np.float32)
@@ -93,12 +94,12 @@ class _Graph:
             name = self.add("Relu", [self.convolution(name, *_folded(block))])
         return name
 
-    def model(self) -> onnx.ModelProto:
-        shape = ["n", 3, "rows", "columns"]
+    def model(self, name: str, channels: int, scores: int) -> onnx.ModelProto:
+        shape = ["n", channels, "rows", "columns"]
         images = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
-        shape = ["n", PLANES * CLASSES, "rows", "columns"]
-        scores = helper.make_tensor_value_info("scores", TensorProto.FLOAT, shape)
-        graph = helper.make_graph(self.nodes, "heart", [images], [scores], self.weights)
+        shape = ["n", scores, "rows", "columns"]
+        said = helper.make_tensor_value_info("scores", TensorProto.FLOAT, shape)
+        graph = helper.make_graph(self.nodes, name, [images], [said], self.weights)
         imports = [helper.make_opsetid("", OPSET)]
         model = helper.make_model(graph, opset_imports=imports, ir_version=8)
         onnx.checker.check_model(model)

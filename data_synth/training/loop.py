@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import queue
 import threading
@@ -9,18 +10,19 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from data_synth.training.export import write_onnx
-from data_synth.training.network import HeartNet, loss
+from data_synth.training.network import HeartNet, UNet, loss
 from data_synth.training.render import ALL_PARTS, Parts, draw_sample
 
 Label = npt.NDArray[np.uint8]
 Report = Callable[[int, float, float], None]
+Net = TypeVar("Net", bound=UNet)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,8 @@ class TrainSettings:
 
 
 Batch = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
+Loss = Callable[[Any, Any, float], Any]
+"""Of scores and labels, with the weight of the Dice term."""
 
 
 def draw_batches(blocks: Sequence[Label], settings: TrainSettings) -> Iterator[Batch]:
@@ -69,12 +73,11 @@ def draw_batches(blocks: Sequence[Label], settings: TrainSettings) -> Iterator[B
 class Average:
     """Running mean of weights: smoother than the last step's, and what is exported."""
 
-    def __init__(self, network: HeartNet) -> None:
-        self.network = HeartNet()
-        self.network.load_state_dict(network.state_dict())
+    def __init__(self, network: UNet) -> None:
+        self.network = copy.deepcopy(network)
         self.steps = 0
 
-    def update(self, network: HeartNet) -> None:
+    def update(self, network: UNet) -> None:
         """Take in the weights after one more step."""
         self.steps += 1
         keep = min(0.997, self.steps / (self.steps + 20))
@@ -90,14 +93,27 @@ class Average:
 def train(
     blocks: Sequence[Label], settings: TrainSettings, out: Path, report: Report | None = None
 ) -> HeartNet:
-    """Train a network, writing ``out/heart.onnx`` and ``out/heart.pt`` now and then and at the end.
+    """Train the network of MR, writing ``out/heart.onnx`` and ``out/heart.pt``: see `learn`."""
+    batches = draw_batches(blocks, settings)
+    return learn(HeartNet, batches, loss, settings, out / "heart", report)
 
-    The result depends on the blocks, the seed and the number of steps alone (on one kind of
+
+def learn(
+    make: Callable[[], Net],
+    batches: Iterator[Batch],
+    loss_of: Loss,
+    settings: TrainSettings,
+    out: Path,
+    report: Report | None = None,
+) -> Net:
+    """Train a network, writing ``out`` as ``.onnx`` and ``.pt`` now and then and at the end.
+
+    The result depends on the batches, the seed and the number of steps alone (on one kind of
     processor) when ``minutes`` does not cut it short.
     """
     torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
-    network = HeartNet().to(memory_format=torch.channels_last)
+    network = make().to(memory_format=torch.channels_last)
     if settings.start is not None:
         network.load_state_dict(torch.load(settings.start, weights_only=True))
     # Before anything is written: it may lie where this run's own checkpoints will.
@@ -106,7 +122,7 @@ def train(
     optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3)
     started_s = time.monotonic()
     exported_s = started_s
-    for step, batch in enumerate(_ahead(draw_batches(blocks, settings), settings.steps)):
+    for step, batch in enumerate(_ahead(batches, settings.steps)):
         minutes = (time.monotonic() - started_s) / 60
         done = max(step / settings.steps, minutes / settings.minutes)
         if done >= 1:
@@ -114,7 +130,8 @@ def train(
         rate = _rate(done, step) * settings.learning_rate
         first, final = settings.overlap_weight
         first = final if settings.start else first
-        value = _learn(network, optimiser, batch, rate, first + done * (final - first))
+        weight = first + done * (final - first)
+        value = _learn(network, optimiser, batch, rate, weight, loss_of)
         average.update(network)
         if report is not None:
             report(step + 1, value, minutes)
@@ -127,7 +144,7 @@ def train(
     return average.network
 
 
-def move_halfway(network: HeartNet, others: Mapping[str, Any]) -> None:
+def move_halfway(network: UNet, others: Mapping[str, Any]) -> None:
     """Replace weights and running statistics by their mean with ``others``."""
     with torch.no_grad():
         for name, value in network.state_dict().items():
@@ -135,11 +152,11 @@ def move_halfway(network: HeartNet, others: Mapping[str, Any]) -> None:
                 value.add_(others[name]).div_(2)
 
 
-def save(out: Path, network: HeartNet) -> None:
-    """Write the network as ONNX and as a checkpoint of torch's."""
+def save(out: Path, network: UNet) -> None:
+    """Write the network as ``out.onnx`` and as a checkpoint of torch's, ``out.pt``."""
     network.eval()
-    write_onnx(out / "heart.onnx", network)
-    torch.save(network.state_dict(), out / "heart.pt")
+    write_onnx(out.with_suffix(".onnx"), network)
+    torch.save(network.state_dict(), out.with_suffix(".pt"))
 
 
 def _rate(done: float, step: int) -> float:
@@ -148,7 +165,12 @@ def _rate(done: float, step: int) -> float:
 
 
 def _learn(
-    network: HeartNet, optimiser: Any, batch: Batch, rate: float, overlap_weight: float
+    network: UNet,
+    optimiser: Any,
+    batch: Batch,
+    rate: float,
+    overlap_weight: float,
+    loss_of: Loss,
 ) -> float:
     """One step of gradient descent; returns the loss."""
     images = torch.from_numpy(batch[0]).to(memory_format=torch.channels_last)
@@ -158,7 +180,7 @@ def _learn(
     network.train()
     with torch.autocast("cpu", torch.bfloat16):
         scores = network(images)
-    value = loss(scores, labels, overlap_weight)
+    value = loss_of(scores, labels, overlap_weight)
     optimiser.zero_grad(set_to_none=True)
     value.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)

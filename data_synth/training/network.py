@@ -1,7 +1,9 @@
-"""The network: a small U-Net that labels a slice and the planes a third of a spacing beside it."""
+"""The networks: small U-Nets. That of MR labels a slice and the planes a third of a spacing
+beside it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -25,27 +27,27 @@ def _block(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-class HeartNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
-    """Three neighbouring slices in, seven classes on three planes out.
+class UNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
+    """Images of so many channels in, so many scores for every pixel out.
 
     Skips are added, not concatenated, after a 1x1 convolution on the way up: half the arithmetic
     of the usual U-Net at the same number of levels, which matters on a CPU.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int, scores: int, widths: Sequence[int]) -> None:
         super().__init__()
-        self.down = nn.ModuleList([nn.Sequential(_block(3, WIDTHS[0]))])
-        for inputs, outputs in pairwise(WIDTHS):
+        self.down = nn.ModuleList([nn.Sequential(_block(channels, widths[0]))])
+        for inputs, outputs in pairwise(widths):
             self.down.append(nn.Sequential(_block(inputs, outputs), _block(outputs, outputs)))
         self.narrow, self.up = nn.ModuleList(), nn.ModuleList()
-        for inputs, outputs in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True):
+        for inputs, outputs in zip(widths[:0:-1], widths[-2::-1], strict=True):
             self.narrow.append(nn.Conv2d(inputs, outputs, 1))
-            count = 1 if outputs == WIDTHS[0] else 2
+            count = 1 if outputs == widths[0] else 2
             self.up.append(nn.Sequential(*[_block(outputs, outputs) for _ in range(count)]))
-        self.head = nn.Conv2d(WIDTHS[0], PLANES * CLASSES, 1)
+        self.head = nn.Conv2d(widths[0], scores, 1)
 
     def forward(self, images: Any) -> Any:
-        """Scores ``(n, plane * class, row, column)`` of images ``(n, 3, row, column)``."""
+        """Scores ``(n, scores, row, column)`` of images ``(n, channels, row, column)``."""
         skips = []
         features = images
         for number, block in enumerate(self.down):
@@ -56,6 +58,13 @@ class HeartNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
             features = functional.interpolate(narrow(features), scale_factor=2.0, mode="nearest")
             features = block(features + skips.pop())
         return self.head(features)
+
+
+class HeartNet(UNet):
+    """Three neighbouring slices in, seven classes on three planes out, plane by plane."""
+
+    def __init__(self) -> None:
+        super().__init__(3, PLANES * CLASSES, WIDTHS)
 
 
 def loss(scores: Any, labels: Any, overlap_weight: float = 1.0) -> Any:

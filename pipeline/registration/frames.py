@@ -33,6 +33,19 @@ class TrackedSweep(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class BloodSweep:
+    """A sweep whose pictures tell how probable blood is; see `pipeline.registration.reading`."""
+
+    name: str
+    images: Float32
+    """``(n, h, w)`` from 0 to 1; 0 all over where a picture shows no body."""
+
+    tracker_from_image: Float
+    sector: Mask
+    """``(h, w)``."""
+
+
+@dataclass(frozen=True, slots=True)
 class DisplacedSweep:
     """A sweep whose pictures stand in the wrong place; see `mirrored` and `backwards`."""
 
@@ -57,8 +70,8 @@ class Lattice:
     brightest: float
     """Largest grey value of the sweep."""
 
-    contact: Contact
-    """Whether a picture shows a body, or a probe in air."""
+    contact: Contact | None
+    """Whether a picture of grey values shows a body, or a probe in air; None for blood."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +82,8 @@ class Samples:
     """``(samples, 3)`` tracker millimetres."""
 
     grey: Float32
-    """``(samples,)``: ranks, of mean 0 in each frame, free of its trend, of variance 1."""
+    """``(samples,)``: ranks of grey values, or how far from blood; of mean 0 in each frame, free of
+    its trend, of variance 1."""
 
     trend: Float32
     """``(rows, columns)``: orthonormal in each frame, or 0 beyond its last column; what grey values
@@ -138,17 +152,26 @@ def sample_frames(
     return _join(parts)
 
 
-def mirrored(sweep: TrackedSweep) -> DisplacedSweep:
+def mirrored(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with left and right exchanged: the same pictures and sector, no anatomy."""
-    columns = np.flatnonzero(_sector(sweep).any(axis=0))
+    columns = np.flatnonzero(sector_of(sweep).any(axis=0))
     swap = np.eye(4)
     swap[0, 0], swap[0, 3] = -1, columns[0] + columns[-1]
-    return DisplacedSweep(f"{sweep.name} mirrored", sweep.images, sweep.tracker_from_image @ swap)
+    return _displaced(sweep, "mirrored", sweep.images, sweep.tracker_from_image @ swap)
 
 
-def backwards(sweep: TrackedSweep) -> DisplacedSweep:
+def backwards(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with its pictures in reverse order: each at the pose and phase of another."""
-    return DisplacedSweep(f"{sweep.name} backwards", sweep.images[::-1], sweep.tracker_from_image)
+    return _displaced(sweep, "backwards", sweep.images[::-1], sweep.tracker_from_image)
+
+
+def _displaced(
+    sweep: TrackedSweep, how: str, images: Float32, tracker_from_image: Float
+) -> TrackedSweep:
+    name = f"{sweep.name} {how}"
+    if isinstance(sweep, BloodSweep):
+        return BloodSweep(name, images, tracker_from_image, sweep.sector)
+    return DisplacedSweep(name, images, tracker_from_image)
 
 
 def choose(samples: Samples, frames: Integer) -> Samples:
@@ -168,13 +191,25 @@ def choose(samples: Samples, frames: Integer) -> Samples:
     )
 
 
-def _require_sweep(sweep: TrackedSweep, phases: Float) -> None:
+def require_transforms(sweep: TrackedSweep) -> None:
+    """Refuse pictures that have not a transform each.
+
+    Raises
+    ------
+    InputError
+        When shapes do not fit.
+    """
     count = len(sweep.images)
     if sweep.images.ndim != 3 or sweep.tracker_from_image.shape != (count, 4, 4):
         raise InputError(
             f"{sweep.name}: needs images (n, h, w) and transforms (n, 4, 4), got "
             f"{sweep.images.shape} and {sweep.tracker_from_image.shape}"
         )
+
+
+def _require_sweep(sweep: TrackedSweep, phases: Float) -> None:
+    require_transforms(sweep)
+    count = len(sweep.images)
     if phases.shape != (count,) or not ((phases >= 0) & (phases < 1)).all():
         raise InputError(
             f"{sweep.name}: needs {count} phases in [0, 1), one a frame, got {phases.shape}"
@@ -202,12 +237,12 @@ def lattice_of(
     InputError
         When the sweep shows no sector, or its transform does not map pixels to millimetres.
     """
-    pixel_mm = _pixel_size_mm(sweep)
-    sector = _sector(sweep)
+    pixel_mm = pixel_size_mm(sweep)
+    sector = sector_of(sweep)
     at = _lattice(sector, pixel_mm, spacing_mm)
     smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
     trend = _trend(at * pixel_mm, trend_mm)
-    contact = Contact.of(sector, pixel_mm)
+    contact = None if isinstance(sweep, BloodSweep) else Contact.of(sector, pixel_mm)
     return Lattice(at, smoothing, trend, float(sweep.images.max()), contact)
 
 
@@ -217,14 +252,19 @@ def sample_pictures(
     """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that show a body.
 
     A sample's grey value is its rank among the frame's: whatever the scanner's curve from echo to
-    grey, a few glaring mirrors count for no more than their number.
+    grey, a few glaring mirrors count for no more than their number. Blood counts as it is, and is
+    dark as in grey values.
     """
     seen = (lattice.smoothing @ images.reshape(len(images), -1).T).T
     # A flat picture (a dead frame) has rounding errors for contrast.
     lively = seen.std(axis=1) > 1e-3 * max(lattice.brightest, 1e-30)
-    kept = np.flatnonzero(usable & lively & lattice.contact.touching(images))
-    rank = rankdata(seen[kept], axis=1) / len(lattice.at)
-    grey = rank - (rank @ lattice.trend) @ lattice.trend.T
+    if lattice.contact is None:
+        kept = np.flatnonzero(usable & lively)
+        bright = 1 - seen[kept]
+    else:
+        kept = np.flatnonzero(usable & lively & lattice.contact.touching(images))
+        bright = rankdata(seen[kept], axis=1) / len(lattice.at)
+    grey = bright - (bright @ lattice.trend) @ lattice.trend.T
     spread = np.maximum(grey.std(axis=1), 1e-9)
     pixels = np.column_stack([lattice.at, np.zeros(len(lattice.at)), np.ones(len(lattice.at))])
     points = np.einsum("fij,sj->fsi", tracker_from_image[kept, :3], pixels)
@@ -239,7 +279,7 @@ def sample_pictures(
     )
 
 
-def _pixel_size_mm(sweep: TrackedSweep) -> Float:
+def pixel_size_mm(sweep: TrackedSweep) -> Float:
     """Width and height of a pixel."""
     axes = sweep.tracker_from_image[:, :3, :2]
     usable = axes[np.isfinite(sweep.tracker_from_image).all(axis=(1, 2))]
@@ -255,8 +295,10 @@ def _pixel_size_mm(sweep: TrackedSweep) -> Float:
     return np.asarray(middle)
 
 
-def _sector(sweep: TrackedSweep) -> Mask:
+def sector_of(sweep: TrackedSweep) -> Mask:
     """Where the sweep ever shows anything, ``(h, w)``; dark blood inside counts as shown."""
+    if isinstance(sweep, BloodSweep):
+        return sweep.sector
     shown = np.isfinite(sweep.images).all(axis=0) & (sweep.images.max(axis=0) > 0)
     sector = binary_fill_holes(binary_closing(shown, iterations=3) | shown)
     if sector is None or sector.mean() < 0.02:

@@ -25,6 +25,7 @@ from pipeline.registration.frames import (
     sample_pictures,
 )
 from pipeline.registration.pose_search import Pivot
+from pipeline.registration.reading import Reader, as_compared
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import agreement
@@ -68,6 +69,23 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True)
+class Eye:
+    """How new pictures of one sweep's geometry are looked at."""
+
+    lattice: Lattice
+    reader: Reader | None
+    """Finds the blood that is compared; None: grey values are."""
+
+    def sample(self, image: Float32, tracker_from_image: Float, phase: float) -> Samples:
+        """Samples of one picture ``(h, w)``; none where it shows no body or has no pose."""
+        images, transforms = image[None], tracker_from_image[None]
+        if self.reader is not None:
+            images, transforms = self.reader.read(images), self.reader.placed(transforms)
+        usable = np.asarray(np.isfinite(transforms).all(axis=(1, 2)))
+        return sample_pictures(self.lattice, images, transforms, np.array([phase]), usable)
+
+
+@dataclass(frozen=True, slots=True)
 class Follower:
     """All that does not change from frame to frame."""
 
@@ -89,7 +107,7 @@ class Follower:
     def follow(
         self,
         state: LiveState,
-        lattice: Lattice,
+        eye: Eye,
         image: Float32,
         tracker_from_image: Float,
         phase: float,
@@ -98,8 +116,8 @@ class Follower:
 
         Parameters
         ----------
-        lattice
-            Of the sweep's geometry, from `pipeline.registration.frames.lattice_of`.
+        eye
+            Of the sweep's geometry, from `prepare_follower`.
         image
             ``(h, w)`` grey values.
         tracker_from_image
@@ -115,10 +133,7 @@ class Follower:
         if not 0 <= phase < 1:
             raise InputError(f"a frame's phase must lie in [0, 1), got {phase!r}")
         waited = state.covariance_mm2 + self.creep_mm**2 * np.eye(6)
-        usable = np.isfinite(tracker_from_image).all(keepdims=True)
-        samples = sample_pictures(
-            lattice, image[None], tracker_from_image[None], np.array([phase]), usable.ravel()
-        )
+        samples = eye.sample(image, tracker_from_image, phase)
         if samples.frames == 0:
             return self._drift(replace(state, covariance_mm2=waited), used=False)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
@@ -157,12 +172,12 @@ def prepare_follower(
     registered: Registration,
     settings: RegisterSettings | None = None,
     cine: Cine | None = None,
-) -> tuple[Follower, LiveState, list[Lattice]]:
+) -> tuple[Follower, LiveState, list[Eye]]:
     """What is needed to follow a registration, from what it was made with.
 
     Returns
     -------
-    The follower, the state to begin with, and for each sweep the lattice for new frames of its
+    The follower, the state to begin with, and for each sweep the eye for new frames of its
     geometry.
 
     Raises
@@ -173,7 +188,8 @@ def prepare_follower(
     settings = settings or RegisterSettings()
     pose = registered.mr_from_tracker
     search = prepare_search(phases, surfaces, pose, settings, cine)
-    level = search.fine_level(sweeps)
+    compared = as_compared(sweeps, settings)
+    level = search.fine_level(compared)
     good = np.flatnonzero(registered.valid[level.samples.number])
     level = level.only(good).thinned(settings.max_frames)
 
@@ -185,11 +201,17 @@ def prepare_follower(
     spread = sandwich(curvature, sweep)
     follower = Follower(search.fine, search.pivot, pose, information_of(spread, curvature.bending))
     lengths_mm = settings.sample_spacing_mm, settings.smoothing_mm, settings.trend_mm
-    lattices = [lattice_of(sweep, *lengths_mm) for sweep in sweeps]
+    eyes = [
+        Eye(
+            lattice_of(seen, *lengths_mm),
+            Reader.of(sweep, hurried=True) if settings.reading == "network" else None,
+        )
+        for seen, sweep in zip(compared, sweeps, strict=True)
+    ]
     usual = float(np.median(1 - registered.residual[registered.valid]))
     scale = np.repeat([1.0, search.pivot.lever_mm], 3)
     covariance_mm2 = registered.covariance * np.outer(scale, scale)
-    return follower, LiveState(pose, covariance_mm2, usual), lattices
+    return follower, LiveState(pose, covariance_mm2, usual), eyes
 
 
 def information_of(covariance_mm2: Float, bending: Float) -> float:

@@ -165,14 +165,18 @@ def prepare_search(
 ) -> Search:
     """Draw the model, rough and fine.
 
-    ``cine``: what the surfaces were found in, for the muscle inside the cavities.
+    ``cine``: what the surfaces were found in, for the muscle inside the cavities, which grey values
+    show and a network counts to the blood.
 
     Raises
     ------
     InputError
         When there is no cavity, or surfaces and cine have not the same phases.
     """
-    tissue = as_seen(draw_tissue(surfaces, settings.grid_mm, cine))
+    if settings.reading == "grey":
+        tissue = as_seen(draw_tissue(surfaces, settings.grid_mm, cine))
+    else:
+        tissue = draw_tissue(surfaces, settings.grid_mm)
     pivot = pivot_of(cavities_of(surfaces))
     coarse = blurred(tissue, _COARSE_BLUR_MM)
     fine = blurred(tissue, settings.smoothing_mm)

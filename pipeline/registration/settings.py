@@ -20,6 +20,9 @@ class RegisterSettings(BaseModel):
     """Distance between the pixels that are compared, in the plane of a frame."""
     smoothing_mm: float = Field(1.5, gt=0, le=10)
     """Standard deviation of the smoothing that takes out speckle; the model is blurred alike."""
+    reading: Literal["network", "grey"] = "network"
+    """What is compared with the model: the blood that a trained network finds in the pictures, or
+    their grey values as they are."""
     trend_mm: float = Field(20.0, gt=0, le=200)
     """What changes over longer ways than this, across a frame, is taken for gain, shadow and haze,
     and is not looked at; three or more sample spacings."""
@@ -44,7 +47,7 @@ class RegisterSettings(BaseModel):
     model_error_mm: float = Field(0.5, ge=0, le=10)
     """Standard deviation of what all frames share, such as the surfaces' error: along each axis in
     shift, and about each axis at the heart's own radius. No spread between frames shows it."""
-    good_tre_mm: float = Field(1.65, gt=0)
+    good_tre_mm: float = Field(1.6, gt=0)
     """Expected error over the heart up to which a trusted registration is called good."""
     worst_tre_mm: float = Field(4.0, gt=0)
     """Expected error over the heart beyond which it is called failed."""

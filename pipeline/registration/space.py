@@ -25,6 +25,7 @@ from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
 from pipeline.registration.pose_search import Pivot, climb
+from pipeline.registration.reading import as_compared
 from pipeline.registration.search import Level, Search, prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import Size, fitting_size, planes_of
@@ -209,15 +210,16 @@ def find(
         wider_mm = settings.model_error_mm * (1 + _LACKING * len(lacking))
         settings = settings.model_copy(update={"model_error_mm": wider_mm})
     search = prepare_search(phases, surfaces, start, settings, cine)
+    compared = as_compared(sweeps, settings)
     tell(1, _STEPS)
-    require_heart_in_view(search.coarse_level(sweeps), search)
-    best = search.best(sweeps)
-    settled = settle_clock(search, best, sweeps, timing, settings.clock_offset)
+    require_heart_in_view(search.coarse_level(compared), search)
+    best = search.best(compared)
+    settled = settle_clock(search, best, compared, timing, settings.clock_offset)
     search, best = settled.search, settled.best
     tell(2, _STEPS)
-    chance = _by_chance(search, best.pose, sweeps)
+    chance = _by_chance(search, best.pose, compared)
     tell(3, _STEPS)
-    everything = search.fine_level(sweeps)
+    everything = search.fine_level(compared)
     sizes = [len(sweep.images) for sweep in sweeps]
     pose = _refined(everything, best.pose, search)
     everything, pose, calibration = _calibrated(everything, pose, search, sweeps)
