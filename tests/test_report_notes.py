@@ -163,6 +163,24 @@ def test_ultrasound_of_oblong_pixels_is_shown_in_proportion() -> None:
     assert [axis.get_aspect() for axis in figure.axes] == [1.0, 1.5]
 
 
+def test_blood_that_was_found_lies_where_it_was_found_in_the_frame() -> None:
+    step = np.array([2.0, 3.0])
+    blood = pictures.BloodFound(np.zeros((5, 4), np.float32), step)
+    oblong = np.diag([1 / 2, 1 / 3, 1, 1])[None]
+    image = [np.zeros((15, 8), np.float32)]
+    figure = pictures.cuts_on_ultrasound(image, ["a"], oblong, np.zeros(1), {}, [blood])
+    frame, below = figure.axes
+    assert (below.get_xlim(), below.get_ylim()) == (frame.get_xlim(), frame.get_ylim())
+    assert below.get_aspect() == frame.get_aspect() == 1.5
+    shown = below.images[0]
+    left, right, bottom, top = shown.get_extent()
+    rows, columns = blood.chance.shape
+    centres = left + (np.arange(columns) + 0.5) * (right - left) / columns
+    np.testing.assert_allclose(centres, step[0] * np.arange(columns))
+    centres = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+    np.testing.assert_allclose(centres, step[1] * np.arange(rows))
+
+
 def test_figures_of_a_ventricle_that_the_stack_cuts_off_say_so() -> None:
     rows = [("LV mass", "45 g"), ("RV ejection fraction", "57 %")]
     assert _of_whole_ventricles(rows, {}) == rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,6 +28,16 @@ from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
 from pipeline.report.slices import mark_sides
 from pipeline.report.style import handle, show_grey, words
+
+
+class BloodFound(NamedTuple):
+    """What was read from an ultrasound frame."""
+
+    chance: Float32
+    """``(row, column)``: how probable blood of a cavity is."""
+
+    step: Float
+    """``(2,)`` columns and rows of the frame from one of its pixels to the next."""
 
 
 def fixture_profiles(fixtures: Mapping[str, Fixture]) -> Figure:
@@ -70,6 +81,7 @@ def cuts_on_ultrasound(
     image_from_mr: Float,
     phases: Float,
     surfaces: Mapping[str, MovingSurface],
+    found: Sequence[BloodFound] = (),
 ) -> Figure:
     """Registered surfaces cut by the plane of each ultrasound frame.
 
@@ -83,27 +95,25 @@ def cuts_on_ultrasound(
         ``(frame, 4, 4)``: MR millimetres to ``(column, row, off-plane)``.
     phases
         ``(frame,)``.
+    found
+        Blood in each frame, drawn in a second row; empty where grey values were compared.
     """
-    figure = Figure(figsize=(3.2 * len(images), 2.9), layout="constrained")
-    axes = figure.subplots(1, len(images), squeeze=False)[0]
-    frames = zip(axes, images, names, image_from_mr, phases, strict=True)
+    tall = 2 if found else 1
+    size = 3.2 * len(images), 2.5 * tall + 0.4
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(tall, len(images), squeeze=False)
+    frames = zip(axes[0], images, names, image_from_mr, phases, strict=True)
     for axis, image, called, transform, phase in frames:
-        wide_mm, high_mm = np.linalg.norm(np.linalg.inv(transform)[:3, :2], axis=0)
-        show_grey(axis, image, float(high_mm / wide_mm))
-        for name, (colour, style) in SURFACE_STYLES.items():
-            if name not in surfaces:
-                continue
-            moving = surfaces[name]
-            # Joined, for dashes begin anew with every piece, and pieces are shorter than they.
-            nearest = moving.at(nearest_phase(moving.phases, phase))
-            lines = joined(plane_cut(nearest, transform))
-            axis.add_collection(
-                LineCollection(lines, colors=colour, linestyles=style, linewidths=1.2)
-            )
-        rows, columns = image.shape
-        axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+        show_grey(axis, image, _aspect(transform))
+        _draw_cuts(axis, image.shape, transform, float(phase), surfaces)
         # Names of files may hold what would be taken for a formula.
         axis.set_title(f"{called}, phase {phase:.2f}", fontsize=9, parse_math=False)
+    if found:
+        below = zip(axes[1], images, found, image_from_mr, phases, strict=True)
+        for axis, image, blood, transform, phase in below:
+            _show_blood(axis, blood, _aspect(transform))
+            _draw_cuts(axis, image.shape, transform, float(phase), surfaces)
+            axis.set_title("blood found (light)", fontsize=9)
     drawn = {name: style for name, style in SURFACE_STYLES.items() if name in surfaces}
     figure.legend(
         handles=[handle(name, *style) for name, style in drawn.items()],
@@ -112,6 +122,41 @@ def cuts_on_ultrasound(
         fontsize=9,
     )
     return figure
+
+
+def _aspect(image_from_mr: Float) -> float:
+    """Height of a pixel over its width."""
+    wide_mm, high_mm = np.linalg.norm(np.linalg.inv(image_from_mr)[:3, :2], axis=0)
+    return float(high_mm / wide_mm)
+
+
+def _show_blood(axis: Axes, found: BloodFound, aspect: float) -> None:
+    """In the frame's own columns and rows, so that the same lines fit."""
+    (rows, columns), (across, down) = found.chance.shape, found.step
+    ends = (-0.5 * across, (columns - 0.5) * across, (rows - 0.5) * down, -0.5 * down)
+    # Certainty is light grey: on white, yellow and dotted lines are lost.
+    axis.imshow(found.chance, cmap="gray", vmin=0, vmax=1.6, extent=ends, aspect=aspect)
+    axis.set_axis_off()
+
+
+def _draw_cuts(
+    axis: Axes,
+    shape: tuple[int, ...],
+    image_from_mr: Float,
+    phase: float,
+    surfaces: Mapping[str, MovingSurface],
+) -> None:
+    """Lines of the surfaces in the plane of a frame of ``shape`` (rows, columns)."""
+    for name, (colour, style) in SURFACE_STYLES.items():
+        if name not in surfaces:
+            continue
+        moving = surfaces[name]
+        # Joined, for dashes begin anew with every piece, and pieces are shorter than they.
+        nearest = moving.at(nearest_phase(moving.phases, phase))
+        lines = joined(plane_cut(nearest, image_from_mr))
+        axis.add_collection(LineCollection(lines, colors=colour, linestyles=style, linewidths=1.2))
+    rows, columns = shape
+    axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
 
 
 def plane_cut(surface: Surface, image_from_mr: Float) -> Float:

@@ -50,6 +50,7 @@ def run(job: Job) -> dict[str, Any]:
         "score": round(found.score, 5),
         "start_score": round(found.start_score, 5),
         "confidence": round(found.confidence, 2),
+        "reading": job.settings.register_.reading,
         "verdict": found.verdict,
         "reason": found.reason,
         "expected_tre_mm": round(found.expected_mm, 3),

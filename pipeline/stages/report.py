@@ -17,6 +17,7 @@ from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
 from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.registration.correction import put_right
+from pipeline.registration.reading import Reader
 from pipeline.registration.uncertainty import expected_tre_mm
 from pipeline.report import certainty, certificate, heart, pictures
 from pipeline.report.moments import Moments
@@ -26,6 +27,11 @@ from pipeline.report.style import as_png, as_svg, as_webp
 from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts
 
 ULTRASOUND_FRAMES_SHOWN = 4
+BLOOD_TOLD = (
+    "The second row shows where blood of the cavities was found in the same frames, light where it "
+    "is certain: this is what the surfaces were laid over, and it should fill the lines of the "
+    "cavities. "
+)
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -203,7 +209,13 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     )
     names = [f"{row.sweep}, frame {row.frame}" for row in chosen]
     phases = np.array([row.phase for row in chosen])
-    figure = pictures.cuts_on_ultrasound(images, names, image_from_mr, phases, surfaces)
+    blood = []
+    if job.figures("register")["reading"] == "network":
+        readers = {name: Reader.of(sweeps[name]) for name in {row.sweep for row in chosen}}
+        for row, image in zip(chosen, images, strict=True):
+            reader = readers[row.sweep]
+            blood.append(pictures.BloodFound(reader.read(image[None])[0], reader.step))
+    figure = pictures.cuts_on_ultrasound(images, names, image_from_mr, phases, surfaces, blood)
     heart_in_mm = certainty.expected_error(
         surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
     )
@@ -212,7 +224,8 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             "Registration",
             "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
             "phase of the heartbeat. Where the lines follow the walls, the registration holds. "
-            "Below them, how far off it is to be expected at each place of the heart.",
+            + (BLOOD_TOLD if blood else "")
+            + "At last, how far off it is to be expected at each place of the heart.",
             [
                 picture("Ultrasound with the registered surfaces", as_png(figure), "png"),
                 picture(
