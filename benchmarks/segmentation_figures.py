@@ -1,14 +1,15 @@
 """How well phantoms that nobody trained on are segmented, and how truly their surfaces move.
 
     python benchmarks/segmentation_figures.py OUT [--patients 20] [--phases 6] [--seed 701]
-        [--workers 2] [--config FILE] [--redraw]
+        [--workers 2] [--config FILE] [--long-axis] [--redraw]
 
 Writes cine-only studies, one seed each: every pathology in turn, signal-to-noise ratios spread
-over 10 to 40. Runs the pipeline on each until evaluate, and prints, as Markdown, each patient,
-each structure, what was asked and whether it is reached, and how wrong slices of low confidence
-are. It goes on where it was interrupted: studies that are there are used again unless they were
-drawn with other settings (``--redraw`` draws all anew, for when the phantom's code has changed),
-and the pipeline runs again those stages whose code, weights or settings have changed.
+over 10 to 40; ``--long-axis`` adds the 2-, 3- and 4-chamber views. Runs the pipeline on each until
+evaluate, and prints, as Markdown, each patient, each structure, what was asked and whether it is
+reached, and how wrong slices of low confidence are. It goes on where it was interrupted: studies
+that are there are used again unless they were drawn with other settings (``--redraw`` draws all
+anew, for when the phantom's code has changed), and the pipeline runs again those stages whose code,
+weights or settings have changed.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ class Order:
     seed: int
     phases: int
     redraw: bool
+    long_axis: bool = False
+    """With 2-, 3- and 4-chamber views beside the stack."""
 
     @property
     def pathology(self) -> str:
@@ -81,7 +84,8 @@ class Order:
         """Of the phantom."""
         changes = {
             "seed": self.seed + self.number, "pathology": self.pathology, "patient_id": self.name,
-            "cine_only": True, "long_axis": False, "mr": {"phases": self.phases, "snr": self.snr},
+            "cine_only": True, "long_axis": self.long_axis,
+            "mr": {"phases": self.phases, "snr": self.snr},
         }  # fmt: skip
         return read_settings(None, changes)
 
@@ -166,12 +170,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=701, help="of the first patient")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--config", type=Path, help="settings of the pipeline")
+    parser.add_argument("--long-axis", action="store_true", help="with long-axis views")
     parser.add_argument("--redraw", action="store_true", help="draw all studies anew")
     options = parser.parse_args()
     begun = time.perf_counter()
     write_settings(options.out, options.config)
     orders = [
-        Order(options.out, number, options.seed, options.phases, options.redraw)
+        Order(options.out, number, options.seed, options.phases, options.redraw, options.long_axis)
         for number in range(options.patients)
     ]
     patients = measure_all(orders, options.workers)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from cine_files import PHASES, RR_MS, dicom_frame, in_series, write_dicom
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
+from pipeline.imaging import alignment
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
@@ -20,6 +22,7 @@ from pipeline.imaging.long_axis import (
     NO_CROSSINGS,
     PLACE_MM,
     SEARCH_MM,
+    Crossings,
     _at_phases,
     _peak,
     find_crossings,
@@ -272,15 +275,19 @@ def test_the_place_of_best_agreement_is_found_between_the_places_tried() -> None
     np.testing.assert_allclose(found[1], np.linalg.inv(covariance), rtol=1e-6)
 
 
+def in_plane_mm(*given: Any) -> Any:
+    return slice_shifts_mm(*given)[:, :2]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None:
     cine, views, slices_mm, _ = stack_and_views(seed)
     view = view_of(cine)
     truth = in_view(view, slices_mm)
     drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
-    smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
+    smooth = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes)
     crossings = find_crossings(cine, views, view, drawn)
-    seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
+    seen = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
     assert left_mm(truth - smooth) < left_mm(truth)
     # Three lines a slice, each known to half a step (1 mm) of the search and better, leave
     # 0.5 / sqrt(3) mm on either axis.
@@ -293,7 +300,7 @@ def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
     view = view_of(cine)
     truth = in_view(view, slices_mm)
     drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
-    smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
+    smooth = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes)
     if wrong == "another body":
         off = stack_and_views(77)[1][0]
     else:
@@ -301,7 +308,7 @@ def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
         moved[:3, 3] += (14.0, 21.0, 9.0)
         off = replace(views[0], mr_from_index=moved)
     crossings = find_crossings(cine, [off, *views[1:]], view, drawn)
-    seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
+    seen = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
     assert left_mm(truth - seen) < left_mm(truth - smooth)
 
 
@@ -316,8 +323,8 @@ def test_a_view_that_contradicts_slices_and_views_is_left_out_of_the_equations()
     third = np.array(good.views) == 2
     offsets_mm[third] += np.linspace(-15, 15, third.sum())[:, None]
     bad = replace(good, offsets_mm=offsets_mm)
-    with_bad = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, bad)
-    without = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, good.without(2))
+    with_bad = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, bad)
+    without = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, good.without(2))
     np.testing.assert_allclose(with_bad, without, atol=1e-9)
 
 
@@ -328,3 +335,33 @@ def test_slices_of_one_volume_are_not_moved() -> None:
     assert not slice_shifts_mm(drawn, PIXEL_MM, 2.0 * np.arange(SLICES), view.axes).any()
     thin = replace(cine, mr_from_index=cine.mr_from_index @ np.diag([1, 1, 0.2, 1]))
     assert find_crossings(thin, views, view_of(thin), drawn) is NO_CROSSINGS
+
+
+def test_a_shift_seen_in_the_plane_tells_of_the_one_along_the_normal() -> None:
+    """What is left is the variance of a normal distribution's third component, given two."""
+    count = 400
+    axes = Rotation.from_euler("xyz", [50, 30, 20], degrees=True).as_matrix()
+    covariance = axes @ np.diag(np.square(alignment.BREATH_MM)) @ axes.T
+    shifts_mm = np.random.default_rng(8).multivariate_normal(np.zeros(3), covariance, count)
+    exact = np.tile(1e6 * np.eye(2), (count, 1, 1))
+    cut = Crossings(tuple(range(count)), (0,) * count, shifts_mm[:, :2], exact)
+    nothing = np.zeros((1, count, 4, 4), np.uint8)
+    # So far apart that no slice is held back.
+    found_mm = slice_shifts_mm(nothing, PIXEL_MM, 100.0 * np.arange(count), axes, cut)
+    left_mm = found_mm[:, 2] - shifts_mm[:, 2]
+    given = covariance[2, :2] @ np.linalg.inv(covariance[:2, :2]) @ covariance[:2, 2]
+    expected = covariance[2, 2] - given
+    assert expected < 0.5 * covariance[2, 2]
+    # Four standard deviations of a variance's estimate.
+    assert left_mm.var() == pytest.approx(expected, rel=4 * np.sqrt(2 / count))
+    # Near to one another, they keep their order.
+    near_mm = 5.0 * np.arange(count)
+    moved_mm = slice_shifts_mm(nothing, PIXEL_MM, near_mm, axes, cut)[:, 2]
+    assert np.abs(moved_mm).max() == 5.0 / 4
+    assert np.diff(near_mm - moved_mm).min() >= 5.0 / 2
+    # Slices that no view cuts stay at their height.
+    half = replace(cut.without(0), slices=cut.slices[::2], views=cut.views[::2])
+    half = replace(half, offsets_mm=cut.offsets_mm[::2], precision=exact[::2])
+    alone_mm = slice_shifts_mm(nothing, PIXEL_MM, near_mm, axes, half)
+    assert alone_mm[::2, 2].any()
+    assert not alone_mm[1::2, 2].any()

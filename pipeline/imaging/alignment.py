@@ -1,8 +1,10 @@
-"""Breath-hold shifts: slices moved in their plane so that the heart's axis runs smoothly again.
+"""Breath-hold shifts: slices moved so that the heart's axis runs smoothly again.
 
 Every slice is held in a breath of its own, and the heart lies elsewhere each time, mostly along
 head and feet. Tilt and slow curvature of the heart's axis are anatomy and stay; what jumps from
-slice to slice is taken for breathing. Long-axis views, where there are any, tell both apart.
+slice to slice is taken for breathing. Long-axis views, where there are any, tell both apart. A
+breath moves the heart along one way more than along others, so a shift that views show in a
+slice's plane tells of the one along its normal, which shows in no image.
 """
 
 from __future__ import annotations
@@ -43,6 +45,10 @@ LEAST_AREA_MM2 = 150.0
 VIEW_MM = 6.0
 """Standard deviation of a long-axis view's place: a breath-hold, or a patient who has moved."""
 
+LARGEST_NORMAL = 0.25
+"""Of the distance between slices: how far one may be moved along its normal. Two neighbours never
+come nearer to one another than half of it."""
+
 TRUSTED = 3.0
 """A view is voted out when more than a third of its lines lie farther off what all say, in
 deviations."""
@@ -55,12 +61,14 @@ def slice_shifts_mm(
     axes: Float,
     crossings: Crossings = NO_CROSSINGS,
 ) -> Float:
-    """In-plane shift of every slice that best explains where structures and views lie.
+    """Shift of every slice that best explains where structures and views lie.
 
     The shifts are the most probable ones given normal curvature of the anatomy, normal shifts
     between breath-holds and, where there are long-axis views, how far each slice lies from each
     view: linear least squares, outliers weighted down (Cauchy's weights). Every view has a shift
-    of its own. What moves a slice along the normal cannot be seen in one slice and is left.
+    of its own. What moves a slice along its normal is seen in neither: where a view cuts the slice
+    it is what the shift in the plane lets expect (mean of a normal distribution, given two of its
+    three components), elsewhere the shift is too uncertain to tell, and it is left.
     Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
@@ -77,22 +85,27 @@ def slice_shifts_mm(
 
     Returns
     -------
-    (slice, 2) array
-        How far each slice is displaced along columns and rows, mm; to be taken back.
+    (slice, 3) array
+        How far the heart in each slice is displaced along columns, rows and normal, mm; to be taken
+        back.
     """
     if np.diff(heights_mm).min() < LEAST_STEP_MM:
-        return np.zeros((len(heights_mm), 2))
+        return np.zeros((len(heights_mm), 3))
     bends = _observations(labels, pixel_mm, heights_mm)
     if not len(bends.offsets_mm) and not crossings.slices:
-        return np.zeros((len(heights_mm), 2))
-    # The breathing ellipsoid seen in the plane is what is known of a shift beforehand.
-    covariance = axes[:2] @ np.diag(np.square(BREATH_MM)) @ axes[:2].T
+        return np.zeros((len(heights_mm), 3))
+    # The breathing ellipsoid is what is known of a shift beforehand.
+    covariance = axes @ np.diag(np.square(BREATH_MM)) @ axes.T
+    of_a_slice = np.linalg.inv(covariance[:2, :2])
     while True:
         known = _joined(bends, _equations(crossings, len(heights_mm)))
-        shifts_mm, left = _solved(known, np.linalg.inv(covariance), len(heights_mm))
+        shifts_mm, left = _solved(known, of_a_slice, len(heights_mm))
         doubted = _doubted_view(crossings, left[len(bends.offsets_mm) :])
         if doubted is None:
-            return shifts_mm
+            most_mm = LARGEST_NORMAL * np.diff(heights_mm).min()
+            normal_mm = np.clip(shifts_mm @ of_a_slice @ covariance[:2, 2], -most_mm, most_mm)
+            cut = np.isin(np.arange(len(heights_mm)), crossings.slices)
+            return np.column_stack([shifts_mm, np.where(cut, normal_mm, 0)])
         crossings = crossings.without(doubted)
 
 

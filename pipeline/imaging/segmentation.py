@@ -248,17 +248,19 @@ def _isotropic(
     """
     view = found.view
     heights_mm = view.slice_step_mm * np.asarray(acquired, float)
-    shifts_mm = np.zeros((len(acquired), 2))
+    shifts_mm = np.zeros((len(acquired), 3))
     if settings.correct_shifts:
         seen = drawn[:, acquired]
         shifts_mm = slice_shifts_mm(seen, view.pixel_mm, heights_mm, view.axes, crossings)
     count = found.planes_a_slice
     planes = (count * acquired[:, None] + np.arange(count)).ravel()
+    # Planes between two slices stay in line with both.
+    moved_mm = np.interp(found.plane_mm[planes], heights_mm, shifts_mm[:, 2])
     volume, first_mm = isotropic_labels(
         found.value if len(acquired) == len(view.order) else found.value[:, planes],
         view.pixel_mm,
-        found.plane_mm[planes],
-        np.repeat(shifts_mm, count, axis=0),
+        found.plane_mm[planes] - moved_mm,
+        np.repeat(shifts_mm[:, :2], count, axis=0),
         # What lies beyond the outer slices is theirs to half a step, planes between included.
         view.slice_step_mm / 2 + found.plane_mm[0],
         settings.grid_mm,
