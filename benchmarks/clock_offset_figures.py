@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from registration_studies import TRUTH_PHASES, found_surfaces
+from registration_studies import found_surfaces, true_surfaces
 
 from data_synth.pathology import PATHOLOGIES
 from data_synth.probe import EXAMINATIONS
@@ -112,13 +112,7 @@ def _model(settings: PhantomSettings, surfaces: str) -> tuple[dict[str, MovingSu
         products = Path(surfaces) / f"{settings.seed}-{settings.pathology}"
         cycle = read_table(products / "ingest" / "phases.json")
         return found_surfaces(products), float(cycle["rr_s"])
-    heart = load_heart(settings)
-    meshes = [heart.surfaces(float(phase)) for phase in TRUTH_PHASES]
-    moving = {
-        name: MovingSurface(np.array([mesh[name][0] for mesh in meshes]), triangles, TRUTH_PHASES)
-        for name, (_, triangles) in meshes[0].items()
-    }
-    return moving, 60 / settings.heart_rate_bpm
+    return true_surfaces(settings), 60 / settings.heart_rate_bpm
 
 
 def _as_read(sweep: Sweep) -> DisplacedSweep:

@@ -1,19 +1,20 @@
 """How truly, how surely and how fast tracked ultrasound is registered, over unseen studies.
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
-        [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--peer 20]
-        [--global 0] [--calibration-error MM DEG] [--mr-pixels 1] [--reading network|grey]
+        [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--phases 20]
+        [--peer 20] [--global 0] [--calibration-error MM DEG] [--mr-pixels 1]
+        [--reading network|grey]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
 ``--surfaces`` names a folder of products, one a patient named ``<seed>-<pathology>`` as
 benchmarks/segmentation_figures.py leaves them: its hearts are registered to what the pipeline found
-in the cine, and to the cine itself, rather than to the phantom's own meshes. ``--peer N`` runs
-SimpleITK's mutual information beside it on the first N studies, ``--global N`` registers the first
-N without any start. ``--calibration-error MM DEG`` puts the pictures of each sweep so far beside
-their place, and registers with ``calibration: per_sweep`` too (0 0: nothing is wrong).
-``--mr-pixels 1.05`` tells pixels of the cine as larger by 5 % than they are. Results are kept line
-by line in OUT/results.jsonl; what is there is not done again.
+in the cine, and to the cine itself, rather than to the phantom's own meshes at ``--phases`` moments
+of the beat. ``--peer N`` runs SimpleITK's mutual information beside it on the first N studies,
+``--global N`` registers the first N without any start. ``--calibration-error MM DEG`` puts the
+pictures of each sweep so far beside their place, and registers with ``calibration: per_sweep`` too
+(0 0: nothing is wrong). ``--mr-pixels 1.05`` tells pixels of the cine as larger by 5 % than they
+are. Results are kept line by line in OUT/results.jsonl; what is there is not done again.
 """
 
 from __future__ import annotations
@@ -201,7 +202,7 @@ def result_of(
     if method == "peer":
         measured = peer(order, study, guess)
     else:
-        surfaces, cine = _model(order, products)
+        surfaces, cine = _model(order, products, arguments.phases)
         if arguments.mr_pixels != 1:
             assert cine is not None, "--mr-pixels needs --surfaces PRODUCTS, which have a cine"
             study, surfaces, cine = with_pixels_wrong(study, surfaces, cine, arguments.mr_pixels)
@@ -214,10 +215,12 @@ def result_of(
     return about | {key: getattr(order, key) for key in keys} | measured
 
 
-def _model(order: Order, products: Path | None) -> tuple[dict[str, MovingSurface], Cine | None]:
+def _model(
+    order: Order, products: Path | None, phases: int
+) -> tuple[dict[str, MovingSurface], Cine | None]:
     """The moving surfaces, and the cine that they were found in."""
     if products is None:
-        return true_surfaces(order), None
+        return true_surfaces(order.settings(), phases), None
     folder = products / f"{order.seed}-{order.pathology}"
     return found_surfaces(folder), read_cine(folder / "ingest")
 
@@ -386,6 +389,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=1)
     parser.add_argument("--probes", default="combined,intracardiac,epicardial")
     parser.add_argument("--surfaces", default="truth")
+    parser.add_argument("--phases", type=int, default=20, help="of the phantom's own surfaces")
     parser.add_argument("--peer", type=int, default=20)
     parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
     parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")

@@ -27,7 +27,6 @@ from pipeline.registration.correction import tracker_from_picture
 
 SWEEPS, RECORDED = 2, 24
 """How many sweeps are recorded, and frames in each."""
-TRUTH_PHASES = np.arange(20) / 20
 
 
 @dataclass(frozen=True)
@@ -177,12 +176,12 @@ def noisier(
     return np.stack(noisy)
 
 
-def true_surfaces(order: Order) -> dict[str, MovingSurface]:
-    """The phantom's own meshes through the beat."""
-    heart = load_heart(order.settings())
-    meshes = [heart.surfaces(float(phase)) for phase in TRUTH_PHASES]
+def true_surfaces(settings: PhantomSettings, count: int = 20) -> dict[str, MovingSurface]:
+    """The phantom's own meshes at so many phases."""
+    heart, phases = load_heart(settings), np.arange(count) / count
+    meshes = [heart.surfaces(float(phase)) for phase in phases]
     return {
-        name: MovingSurface(np.array([mesh[name][0] for mesh in meshes]), triangles, TRUTH_PHASES)
+        name: MovingSurface(np.array([mesh[name][0] for mesh in meshes]), triangles, phases)
         for name, (_, triangles) in meshes[0].items()
     }
 

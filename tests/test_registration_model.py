@@ -14,12 +14,19 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
-from pipeline.geometry import Float, Grid, Surface, transform_points
+from pipeline.geometry import Float, Grid, MovingSurface, Surface, transform_points
 from pipeline.registration.frames import sample_frames
 from pipeline.registration.pose_search import climb, pivot_of
 from pipeline.registration.search import Level
 from pipeline.registration.similarity import agreement
-from pipeline.registration.tissue_map import TissueMap, as_seen, blurred, coverage, draw_tissue
+from pipeline.registration.tissue_map import (
+    TissueMap,
+    as_seen,
+    blurred,
+    coverage,
+    draw_tissue,
+    in_short_steps,
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +37,51 @@ def recording():
 @pytest.fixture(scope="module")
 def tissue_map():
     return blurred(draw_tissue(moving_surfaces(), 2.5), 1.5)
+
+
+def beating_ball(phases: Float) -> MovingSurface:
+    """A ball whose radius is 24 + 6 cos(2 pi phase)."""
+    ball = pv.Icosphere(radius=1.0, nsub=3)
+    triangles = np.asarray(ball.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
+    radius_mm = 24.0 + 6.0 * np.cos(2 * np.pi * phases)
+    return MovingSurface(radius_mm[:, None, None] * np.asarray(ball.points), triangles, phases)
+
+
+class TestPhasesBetween:
+    """Where the model is drawn when the cine has few phases."""
+
+    def test_vertices_follow_the_motion_between_phases(self):
+        """A cubic spline strays from a function by 5/384 h^4 times its largest fourth derivative,
+        a straight line by h^2/8 times its second: here 0.09 and 0.8 mm."""
+        stored = np.arange(6) / 6 + 0.05
+
+        between = in_short_steps({"left_atrium": beating_ball(stored)})["left_atrium"]
+
+        assert np.diff(between.phases, append=between.phases[0] + 1).max() <= 0.06
+        radius_mm = np.linalg.norm(between.vertices_mm, axis=2)
+        truth_mm = 24.0 + 6.0 * np.cos(2 * np.pi * between.phases)
+        strays_mm = 5 / 384 * (2 * np.pi / 6) ** 4 * 6.0
+        # Vertices of the icosphere are float32.
+        assert np.abs(radius_mm - truth_mm[:, None]).max() < strays_mm + 1e-5
+
+    @pytest.mark.parametrize("count", [2, 17, 25, 40])
+    def test_few_steps_and_short_ones_stay_as_they_are(self, count):
+        ball = beating_ball(np.arange(count) / count)
+
+        assert in_short_steps({"left_atrium": ball})["left_atrium"] is ball
+
+    def test_blood_is_drawn_where_the_wall_is_between_phases(self):
+        """The volume where the ball is almost smallest, which no stored phase shows: those beside
+        it are 13 % larger."""
+        stored = (np.arange(6) + 0.5) / 6
+
+        drawn = draw_tissue(in_short_steps({"left_atrium": beating_ball(stored)}), 2.0)
+
+        index = int(np.argmin(np.abs(drawn.phases - 0.5)))
+        radius_mm = 24.0 + 6.0 * np.cos(2 * np.pi * drawn.phases[index])
+        volume_mm3 = drawn.share[index, ..., 0].sum() * 2.0**3
+        # The spline's 0.09 mm of 18, three times in the volume, and 1 % for facets and nodes.
+        assert volume_mm3 == pytest.approx(4 / 3 * np.pi * radius_mm**3, rel=0.025)
 
 
 class TestCoverage:

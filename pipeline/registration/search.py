@@ -21,7 +21,14 @@ from pipeline.registration.pose_search import (
 )
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import Agreement, Expansion, agreement, expansion
-from pipeline.registration.tissue_map import TissueMap, as_seen, blurred, cavities_of, draw_tissue
+from pipeline.registration.tissue_map import (
+    TissueMap,
+    as_seen,
+    blurred,
+    cavities_of,
+    draw_tissue,
+    in_short_steps,
+)
 
 # The rough level: what is smaller than 5 mm is gone, so samples may lie twice that apart.
 _COARSE_BLUR_MM = 5.0
@@ -176,7 +183,7 @@ def prepare_search(
     if settings.reading == "grey":
         tissue = as_seen(draw_tissue(surfaces, settings.grid_mm, cine))
     else:
-        tissue = draw_tissue(surfaces, settings.grid_mm)
+        tissue = draw_tissue(in_short_steps(surfaces), settings.grid_mm)
     pivot = pivot_of(cavities_of(surfaces))
     coarse = blurred(tissue, _COARSE_BLUR_MM)
     fine = blurred(tissue, settings.smoothing_mm)

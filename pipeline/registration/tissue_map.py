@@ -17,6 +17,7 @@ from numba import njit
 from scipy.ndimage import gaussian_filter
 
 from pipeline.errors import InputError
+from pipeline.field.motion import Motion, between
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
@@ -31,6 +32,9 @@ _BEAM_MM, _ECHO_OF_BLOOD = 1.0, 0.05
 _WALL_MM = 2.0
 # Room for the widest blur to fade.
 _MARGIN_MM = 12.0
+# Longer ways between phases are shortened: half-way between two pictures of blood a wall that moved
+# by more than its blur is two faint walls.
+_LONGEST_STEP = 0.06
 # Phases that are worked on at the same time: NumPy and SciPy let others run while they count.
 _THREADS = 2
 
@@ -126,6 +130,26 @@ def cavities_of(surfaces: Mapping[str, MovingSurface]) -> list[MovingSurface]:
             f"surfaces must share their phases; {', '.join(odd)} differ from {names[0]}"
         )
     return [surfaces[name] for name in names]
+
+
+def in_short_steps(surfaces: Mapping[str, MovingSurface]) -> dict[str, MovingSurface]:
+    """The surfaces at more phases where these lie further than 0.06 of a beat apart.
+
+    In between, vertices follow their own periodic spline. Two phases tell no way between them: such
+    surfaces stay as they are.
+    """
+    return {name: _in_short_steps(one) for name, one in surfaces.items()}
+
+
+def _in_short_steps(surface: MovingSurface) -> MovingSurface:
+    longest = np.diff(surface.phases, append=surface.phases[0] + 1).max()
+    count = math.ceil(longest / _LONGEST_STEP)
+    motion = Motion.of(surface) if count > 1 else None
+    if motion is None:
+        return surface
+    moments = np.sort(between(surface.phases, count) % 1.0)
+    places_mm = np.stack([motion.at(moment).vertices_mm for moment in moments])
+    return MovingSurface(places_mm, surface.triangles, moments)
 
 
 def as_seen(tissue: TissueMap) -> TissueMap:
