@@ -2,8 +2,7 @@
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--phases 20]
-        [--peer 20] [--global 0] [--calibration-error MM DEG] [--mr-pixels 1]
-        [--reading network|grey]
+        [--peer 20] [--global 0] [--calibration-error MM DEG] [--mr-pixels 1] [--reading grey]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
@@ -13,8 +12,8 @@ in the cine, and to the cine itself, rather than to the phantom's own meshes at 
 of the beat. ``--peer N`` runs SimpleITK's mutual information beside it on the first N studies,
 ``--global N`` registers the first N without any start. ``--calibration-error MM DEG`` puts the
 pictures of each sweep so far beside their place, and registers with ``calibration: per_sweep`` too
-(0 0: nothing is wrong). ``--mr-pixels 1.05`` tells pixels of the cine as larger by 5 % than they
-are. Results are kept line by line in OUT/results.jsonl; what is there is not done again.
+(0 0: right). ``--mr-pixels 1.05`` tells larger pixels of the cine. What OUT/results.jsonl holds,
+line by line, is not done again.
 """
 
 from __future__ import annotations
@@ -56,6 +55,7 @@ FRAMES = (48, 24, 40, 12, 48, 32, 16)
 DROPOUT = (0.0, 0.2, 0.0, 0.4, 0.6)
 SNR_DB = (None, 20.0, 10.0)
 CAPTURED_MM = 2.0
+Model = tuple[dict[str, MovingSurface], Cine | None]
 SHARES = (1.0, 0.5, 0.75, 0.25)
 """Of 20 mm and 20 degrees: how far off the starts of a study are, in turn."""
 
@@ -215,9 +215,7 @@ def result_of(
     return about | {key: getattr(order, key) for key in keys} | measured
 
 
-def _model(
-    order: Order, products: Path | None, phases: int
-) -> tuple[dict[str, MovingSurface], Cine | None]:
+def _model(order: Order, products: Path | None, phases: int) -> Model:
     """The moving surfaces, and the cine that they were found in."""
     if products is None:
         return true_surfaces(order.settings(), phases), None
