@@ -70,6 +70,12 @@ class TestPhasesBetween:
 
         assert in_short_steps({"left_atrium": ball})["left_atrium"] is ball
 
+    def test_a_gap_in_the_phases_is_not_bridged(self):
+        """Twenty phases that end at 0.76 of the beat: nobody has seen what follows."""
+        ball = beating_ball(np.arange(20) * 0.04)
+
+        assert in_short_steps({"left_atrium": ball})["left_atrium"] is ball
+
     def test_blood_is_drawn_where_the_wall_is_between_phases(self):
         """The volume where the ball is almost smallest, which no stored phase shows: those beside
         it are 13 % larger."""

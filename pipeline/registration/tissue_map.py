@@ -35,6 +35,8 @@ _MARGIN_MM = 12.0
 # Longer ways between phases are shortened: half-way between two pictures of blood a wall that moved
 # by more than its blur is two faint walls.
 _LONGEST_STEP = 0.06
+# A step longer than so many mean ones is a gap in the phases: no spline knows the way through it.
+_GAP = 1.5
 # Phases that are worked on at the same time: NumPy and SciPy let others run while they count.
 _THREADS = 2
 
@@ -135,8 +137,8 @@ def cavities_of(surfaces: Mapping[str, MovingSurface]) -> list[MovingSurface]:
 def in_short_steps(surfaces: Mapping[str, MovingSurface]) -> dict[str, MovingSurface]:
     """The surfaces at more phases where these lie further than 0.06 of a beat apart.
 
-    In between, vertices follow their own periodic spline. Two phases tell no way between them: such
-    surfaces stay as they are.
+    In between, vertices follow their own periodic spline. Two phases, and those with a gap (as of a
+    cine that ends before the beat does), tell no way: such surfaces stay as they are.
     """
     return {name: _in_short_steps(one) for name, one in surfaces.items()}
 
@@ -144,7 +146,8 @@ def in_short_steps(surfaces: Mapping[str, MovingSurface]) -> dict[str, MovingSur
 def _in_short_steps(surface: MovingSurface) -> MovingSurface:
     longest = np.diff(surface.phases, append=surface.phases[0] + 1).max()
     count = math.ceil(longest / _LONGEST_STEP)
-    motion = Motion.of(surface) if count > 1 else None
+    even = longest * len(surface.phases) <= _GAP
+    motion = Motion.of(surface) if count > 1 and even else None
     if motion is None:
         return surface
     moments = np.sort(between(surface.phases, count) % 1.0)
