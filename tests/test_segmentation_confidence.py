@@ -259,6 +259,19 @@ def test_what_is_dropped_beside_the_heart_says_nothing_of_it():
     np.testing.assert_allclose(slice_confidence(cine, found, drawn(found)), alone, atol=0.02)
 
 
+def test_a_stomach_larger_than_any_cut_of_the_heart_is_not_taken_for_it():
+    """For one phase, in the abdomen beyond the tip: the slices of the heart lose nothing by it."""
+    cine, found = beating()
+    found.value[:, 0, 1], found.value[:, 0, 0] = 0, 1
+    alone = slice_confidence(cine, found, drawn(found))
+    found.value[2, 0, 1, :, :14] = 0.9
+    found.value[2, 0, 0] = 1 - found.value[2, 0, 1]
+    labels = drawn(found)
+    assert (labels[2, 0] > 0).sum() > (labels[2, 1:] > 0).sum(axis=(1, 2)).max()
+    beside = slice_confidence(cine, found, labels)
+    np.testing.assert_allclose(beside[:, 1:], alone[:, 1:], atol=0.02)
+
+
 @pytest.mark.parametrize(
     ("radii", "found"),
     [
