@@ -66,7 +66,7 @@ class PlaneProbability:
         return self.value[phase, middle :: self.planes_a_slice]
 
 
-def _sampled(cine: Cine, view: View, phase: int, number: int) -> Float32:
+def sampled_slice(cine: Cine, view: View, phase: int, number: int) -> Float32:
     """One slice's image on the view; where slices are thin, the average over a thickness."""
     together = max(1, round(THICKNESS_MM / view.slice_step_mm))
     near = range(max(0, number - together // 2), min(len(view.order), number + together // 2 + 1))
@@ -94,7 +94,7 @@ def network_images(
     images = {}
     for number in sorted(needed):
         known = view.holds(number, cine.intensity.shape[2:])
-        image = _sampled(cine, view, phase, number)
+        image = sampled_slice(cine, view, phase, number)
         images[number] = (normalise_locally if local else normalise)(image, known)
     shown = []
     for one in chosen:

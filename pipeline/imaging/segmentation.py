@@ -14,6 +14,7 @@ from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
     PlaneProbability,
@@ -119,6 +120,7 @@ def segment_cine(
     _require_understood(seen, confidence, found.view, settings)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
     clean_cycle(found.value, found.view.pixel_mm)
+    end_at_dark_line(found, cine)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
     _require_right_ventricle(drawn)
