@@ -48,6 +48,9 @@ LEAST_TOLD = 0.25
 WHOLE_MM, NONE_MM = 1.5, 4.0
 """How far from the outline pixels move with it, and where they begin to stay."""
 
+MARGIN_PX = 12
+"""Pixels about the left ventricle on a slice that hold all that is looked at or moved."""
+
 LEAST_POINTS = 12
 """An outline of fewer points is too small to have a side."""
 
@@ -84,6 +87,8 @@ class _Outline(NamedTuple):
 
 def _move_planes(planes: Float32, image: Float32, pixel_px: float, pixel_mm: float) -> None:
     """Move the outside on a slice's planes ``(plane, class, row, column)``, in place."""
+    rows, columns = _around(most_probable(planes[len(planes) // 2], axis=0))
+    planes, image = planes[:, :, rows, columns], image[rows, columns]
     probability = planes[len(planes) // 2]
     labels = most_probable(probability, axis=0)
     outline = _outline(probability, labels)
@@ -97,6 +102,17 @@ def _move_planes(planes: Float32, image: Float32, pixel_px: float, pixel_mm: flo
     moves = (move_px[:, None] * outline.outwards).astype(np.float32)
     for plane in planes:
         _move_plane(plane, tree, moves, pixel_mm)
+
+
+def _around(labels: Label) -> tuple[slice, slice]:
+    """Rows and columns that hold the left ventricle and what may move about it."""
+    body = np.isin(labels, (CAVITY, MUSCLE))
+    cut = []
+    for axis in (1, 0):
+        found = np.flatnonzero(body.any(axis=axis))
+        ends = (int(found[0]), int(found[-1])) if len(found) else (0, 0)
+        cut.append(slice(max(0, ends[0] - MARGIN_PX), ends[1] + MARGIN_PX + 1))
+    return cut[0], cut[1]
 
 
 def _outline(probability: Float32, labels: Label) -> _Outline | None:
