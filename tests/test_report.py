@@ -389,12 +389,19 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
         "force_change_max_n_per_ms": None,
     }
     largest = {name: max(soft[name], stiff[name] or 0.0) for name in soft}
-    forces, surfaces = certificate.tables(
-        {"sign_errors": 0, **largest, "structures": {}, "fixtures": {"soft": soft, "stiff": stiff}}
+    surfaces = {"sign_errors": 0, "node_error_near_mm": 4e-7, "band_mm": 15.0, "structures": {}}
+    forces, kept, others = certificate.tables(
+        {**surfaces, **largest, "fixtures": {"soft": soft, "stiff": stiff}},
+        {"node_error_near_mm": 0.001, "sign_errors": 0},
     )
     assert forces.rows == [
         ("soft", "321", "391", "323", "400", "0.2%", "0.43", "0.153"),
         ("stiff", "384", "525", "323", "unknown", "unknown", "0.43", "unknown"),
     ]
     assert len(forces.head) == len(forces.rows[0])
-    assert surfaces.rows == [("sign errors", "0")]
+    assert kept.rows == [
+        ("node error near", "4e-07 mm", "0.001 mm"),
+        ("sign errors", "0", "0"),
+    ]
+    assert len(kept.head) == len(kept.rows[0])
+    assert others.rows == [("band", "15 mm")]

@@ -93,6 +93,16 @@ def rate_bound_n_per_mm(fixture: Fixture, spacing_mm: float) -> float:
     return 8 * fixture.f_max_n / spacing_mm + fixture.stiffness_n_per_m / 1000
 
 
+def allowed_errors(bounds: Bounds, spacing_mm: float) -> dict[str, float]:
+    """The most that figures of a certificate may be, by their names."""
+    return {
+        "node_error_near_mm": bounds.node_error_near_mm,
+        "node_error_far_mm": bounds.node_error_far_mm,
+        "sign_errors": bounds.sign_errors,
+        "surface_error_p99_mm": bounds.surface_error_p99_spacings * spacing_mm,
+    }
+
+
 def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: float) -> None:
     """Refuse a field whose certificate is not within bounds.
 
@@ -101,15 +111,9 @@ def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: floa
     StageError
         Naming every bound that is broken.
     """
-    limits = {
-        "node_error_near_mm": bounds.node_error_near_mm,
-        "node_error_far_mm": bounds.node_error_far_mm,
-        "sign_errors": bounds.sign_errors,
-        "surface_error_p99_mm": bounds.surface_error_p99_spacings * spacing_mm,
-    }
     broken = [
         f"{name} is {accuracy[name]:.4g}, allowed is {limit:.4g}"
-        for name, limit in limits.items()
+        for name, limit in allowed_errors(bounds, spacing_mm).items()
         if not accuracy[name] <= limit
     ]
     if broken:

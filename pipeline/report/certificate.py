@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.report.page import Table, flat_table
+from pipeline.report.page import Table, figure_row, flat_table
 
 COLUMNS = {
     "stiffness_n_per_m": ("by its law N/m", "{:.0f}"),
@@ -19,21 +19,31 @@ COLUMNS = {
 """What is told of each fixture, in this order: a head, and how the figure is written."""
 
 
-def tables(accuracy: Mapping[str, Any]) -> list[Table]:
-    """Forces by fixture, each beside its own law and device; then what is told of the surfaces.
+def tables(accuracy: Mapping[str, Any], allowed: Mapping[str, float]) -> list[Table]:
+    """Forces by fixture, each beside its own law and device; then what had to be kept, beside the
+    most that was ``allowed``; then what else is told of the surfaces.
 
     The largest force figures over all fixtures, which the field's description holds as well, are
     left out: side by side they would be those of different fixtures.
     """
     fixtures: Mapping[str, Mapping[str, Any]] = accuracy["fixtures"]
     of_forces = {name for one in fixtures.values() for name in one}
-    rest = {name: value for name, value in accuracy.items() if name not in of_forces}
+    told = of_forces | set(allowed)
+    rest = {name: value for name, value in accuracy.items() if name not in told}
     rows = [
         (name, *(_written(one[column], style) for column, (_, style) in COLUMNS.items()))
         for name, one in fixtures.items()
     ]
     head = ["stiffness and steps of force", *(head for head, _ in COLUMNS.values())]
-    return [Table(head, rows), flat_table("accuracy certificate", rest)]
+    kept = [
+        (*figure_row(name, accuracy[name]), figure_row(name, most)[1])
+        for name, most in allowed.items()
+    ]
+    return [
+        Table(head, rows),
+        Table(["accuracy certificate", "measured", "at most"], kept),
+        flat_table("beside it", rest),
+    ]
 
 
 def _written(value: float | None, style: str) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.field.certificate import allowed_errors
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
@@ -273,7 +274,13 @@ def _field(job: Job, shown: Moments) -> Section:
             picture("Potential, distance and force", as_png(figure), "png"),
             picture("Force of each fixture", as_svg(profiles), "svg"),
         ],
-        [Table(head, rows), *certificate.tables(job.figures("bake")["accuracy"])],
+        [
+            Table(head, rows),
+            *certificate.tables(
+                job.figures("bake")["accuracy"],
+                allowed_errors(job.settings.bake.bounds, job.settings.bake.spacing_mm),
+            ),
+        ],
     )
 
 
