@@ -28,6 +28,8 @@ MOST_WORST = 4
 MOST_NUMBERS = 60
 """A confidence map of no more cells has its numbers written in."""
 
+SCALE_MM = 20.0
+
 ALARM = "#C00000"
 
 _EDGES = (("left", "right"), ("bottom", "top"))
@@ -88,6 +90,18 @@ def mark_sides(axis: Axes, shown: Moments) -> None:
         axis.text(x, y, text, transform=axis.transAxes, color="white", fontsize=8, **style)
 
 
+def mark_scale(axis: Axes, shown: Moments) -> None:
+    """Draw `SCALE_MM` of the patient into the lower left of a slice's picture."""
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    start, height = left + 0.06 * (right - left), bottom + 0.14 * (top - bottom)
+    length = SCALE_MM / float(np.linalg.norm(shown.mr_from_index[:3, 0]))
+    edge: list[AbstractPathEffect] = [Stroke(linewidth=4, foreground="black"), Normal()]
+    axis.plot([start, start + length], [height] * 2, "-", color="white", lw=2, path_effects=edge)
+    edge = [Stroke(linewidth=2, foreground="black"), Normal()]
+    style: dict[str, Any] = {"color": "white", "fontsize": 8, "path_effects": edge}
+    axis.text(start, height + 0.02 * (top - bottom), f"{SCALE_MM:.0f} mm", va="bottom", **style)
+
+
 def _letters(direction: Float) -> str:
     """Where a direction in LPS points, such as ``LP``: what it points to most comes first.
 
@@ -135,6 +149,7 @@ def contours(
         _title(axis, name, sure, low)
     # One is enough: all slices of a stack lie alike.
     mark_sides(axes[0], shown)
+    mark_scale(axes[0], shown)
     _legend(figure)
     return figure
 
