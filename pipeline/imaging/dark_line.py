@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.inference import PlaneProbability, sampled_slice
-from pipeline.imaging.interpolation import class_margins
+from pipeline.imaging.interpolation import ventricle_margin
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 
 THREADS = 2
@@ -95,7 +95,7 @@ def _move_planes(planes: Float32, image: Float32, pixel_px: float, pixel_mm: flo
     if outline is None:
         return
     along = ALONG_MM / pixel_mm
-    move_px = displacement_px(outline, image, labels, pixel_px, along)
+    move_px = _displacement_px(outline, image, labels, pixel_px, along)
     if not move_px.any():
         return
     tree = cKDTree(outline.points)
@@ -121,18 +121,13 @@ def _outline(probability: Float32, labels: Label) -> _Outline | None:
 
     if not (labels == MUSCLE).any():
         return None
-    margin = _ventricle_margin(probability)
+    margin = ventricle_margin(probability)
     contours = [one for one in find_contours(margin, 0.0) if (one[0] == one[-1]).all()]
     points = max(contours, key=len)[:-1] if contours else np.empty((0, 2))
     if len(points) < LEAST_POINTS:
         return None
     slope = np.stack([_at(np.asarray(one), points) for one in np.gradient(margin)], axis=1)
     return _Outline(points, -slope / np.maximum(np.linalg.norm(slope, axis=1), 1e-9)[:, None])
-
-
-def _ventricle_margin(probability: Float32) -> Float32:
-    others = [k for k in range(len(probability)) if k not in (CAVITY, MUSCLE)]
-    return np.asarray(-class_margins(probability)[others].max(axis=0), np.float32)
 
 
 def _at(image: Float32, points: Float) -> Float32:
@@ -145,7 +140,7 @@ def _at(image: Float32, points: Float) -> Float32:
     return np.asarray(found.reshape(shape))
 
 
-def displacement_px(
+def _displacement_px(
     outline: _Outline, image: Float32, labels: Label, pixel_px: float, along: float
 ) -> Float:
     """How far outwards each point of the outline should move, ``(n,)``, in the view's pixels.

@@ -151,10 +151,15 @@ def ventricle_depth_mm(
     probability: Float32, pixel_mm: float, shift_mm: Float, grid_mm: float
 ) -> Float32:
     """As `plane_depth_mm`, of the left ventricle, cavity and muscle as one: ``(row, column)``."""
-    others = [k for k in range(len(probability)) if k not in (CAVITY, MUSCLE)]
-    margin = -class_margins(probability)[others].max(axis=0)
+    margin = ventricle_margin(probability)
     size = [int((side - 1) * pixel_mm / grid_mm) + 1 for side in margin.shape]
     return _signed_depth_mm(_magnified(margin, pixel_mm, shift_mm, grid_mm, size), grid_mm)
+
+
+def ventricle_margin(probability: Float32) -> Float32:
+    """As `class_margins`, of the left ventricle, cavity and muscle as one: ``(row, column)``."""
+    others = [k for k in range(len(probability)) if k not in (CAVITY, MUSCLE)]
+    return np.asarray(-class_margins(probability)[others].max(axis=0))
 
 
 def class_margins(probability: Float32) -> Float32:
