@@ -91,12 +91,15 @@ def mark_sides(axis: Axes, shown: Moments) -> None:
 
 
 def mark_scale(axis: Axes, shown: Moments) -> None:
-    """Draw `SCALE_MM` of the patient into the lower left of a slice's picture."""
+    """Draw `SCALE_MM` of the patient into the lower left of a slice's picture, if it has room."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     start, height = left + 0.06 * (right - left), bottom + 0.14 * (top - bottom)
     length = SCALE_MM / float(np.linalg.norm(shown.mr_from_index[:3, 0]))
+    if length > 0.5 * (right - left):
+        return
     edge: list[AbstractPathEffect] = [Stroke(linewidth=4, foreground="black"), Normal()]
-    axis.plot([start, start + length], [height] * 2, "-", color="white", lw=2, path_effects=edge)
+    line: dict[str, Any] = {"color": "white", "lw": 2, "path_effects": edge}
+    axis.plot([start, start + length], [height] * 2, "-", scalex=False, scaley=False, **line)
     edge = [Stroke(linewidth=2, foreground="black"), Normal()]
     style: dict[str, Any] = {"color": "white", "fontsize": 8, "path_effects": edge}
     axis.text(start, height + 0.02 * (top - bottom), f"{SCALE_MM:.0f} mm", va="bottom", **style)
