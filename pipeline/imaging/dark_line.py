@@ -18,11 +18,10 @@ from scipy.spatial import cKDTree
 
 from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cine import Cine
+from pipeline.imaging.cleanup import THREADS
 from pipeline.imaging.inference import PlaneProbability, sampled_slice
 from pipeline.imaging.interpolation import ventricle_margin
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
-
-THREADS = 2
 
 INSIDE_PX, OUTSIDE_PX, STEP_PX = 2.0, 0.5, 0.25
 """The line is sought from so many pixels inside the outline to so many outside."""

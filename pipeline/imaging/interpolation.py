@@ -8,10 +8,13 @@ structure that ends between two planes ends half-way, its rim rounded, with no g
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 
 from pipeline.geometry import Float, Float32, Label
+from pipeline.imaging.cleanup import THREADS
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 from pipeline.imaging.tapering import LID_MM, taper_ventricle
 
@@ -75,8 +78,8 @@ def isotropic_labels(
     below_mm, above_mm = plane_mm[0] - reach_mm, plane_mm[-1] + reach_mm
     height_mm = np.arange(below_mm, above_mm + grid_mm, grid_mm)
     slices = np.arange(planes_a_slice // 2, len(plane_mm), planes_a_slice)
-    phases = []
-    for one in probability[:, :, :, cut[0], cut[1]]:
+
+    def labels(one: Float32) -> Label:
         depth_mm = np.stack(
             [
                 plane_depth_mm(plane, pixel_mm, shift_mm, grid_mm)
@@ -91,8 +94,10 @@ def isotropic_labels(
         tapered_mm, tapered_plane_mm = taper_ventricle(
             closed_mm, closed_plane_mm, slices + added, ventricle_mm, BAND_MM
         )
-        phases.append(interpolate_planes(tapered_mm, tapered_plane_mm, height_mm))
-    volume = np.stack(phases)
+        return interpolate_planes(tapered_mm, tapered_plane_mm, height_mm)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        volume = np.stack(list(pool.map(labels, probability[:, :, :, cut[0], cut[1]])))
     first, last = _heights_with_heart(volume, round(margin_mm / grid_mm))
     first_mm = np.array([cut[1].start * pixel_mm, cut[0].start * pixel_mm, height_mm[first]])
     return np.ascontiguousarray(volume[:, first:last]), first_mm
