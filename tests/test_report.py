@@ -197,21 +197,6 @@ def test_a_segment_that_was_not_measured_is_a_gap() -> None:
     assert image.max() == 12
 
 
-@pytest.mark.parametrize("pixel_mm", [1.1, 2.5])
-def test_the_scale_of_a_picture_is_so_long_in_the_patient(pixel_mm: float) -> None:
-    turned = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    frame = np.eye(4)
-    frame[:3, :3] = turned * (pixel_mm, 3.0, 8.0)
-    figure = slices.contours(replace(moments(3), mr_from_index=frame), 0)
-    (line,) = (one for one in figure.axes[0].lines if one.get_color() == "white")
-    assert np.ptp(line.get_xdata()) * pixel_mm == pytest.approx(20)
-    assert np.ptp(line.get_ydata()) == 0
-    assert "20 mm" in [text.get_text() for text in figure.axes[0].texts]
-    frame[:3, :3] = turned * (0.2, 0.2, 8.0)
-    small = slices.contours(replace(moments(3), mr_from_index=frame), 0)
-    assert not [one for one in small.axes[0].lines if one.get_color() == "white"]
-
-
 def test_few_phases_beat_evenly_in_the_animation() -> None:
     """Vertices that run round a square at uneven phases are at even steps of it; truth by hand."""
     phases = np.array([0.1, 0.35, 0.85])

@@ -146,6 +146,23 @@ def test_the_page_says_how_the_stack_lies(turned: bool) -> None:
     assert slices.how_it_lies(replace(shown, labels=labels)).startswith("Right in the pictures")
 
 
+@pytest.mark.parametrize(("pixel_mm", "drawn"), [(1.1, True), (2.5, True), (0.2, False)])
+def test_the_scale_of_a_picture_is_so_long_in_the_patient(pixel_mm: float, drawn: bool) -> None:
+    """In turned images of oblong pixels too; a picture too small for it goes without."""
+    labels = np.zeros((1, 3, 60, 60), np.uint8)
+    labels[:, :, 10:50, 10:50] = LABELS["lv_myocardium"]
+    turned = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    frame = np.eye(4)
+    frame[:3, :3] = turned * (pixel_mm, 3.0, 8.0)
+    grey = np.zeros(labels.shape, np.float32)
+    shown = Moments(("End-diastole",), (0,), np.zeros(1), grey, labels, frame)
+    axis = slices.contours(shown, 0).axes[0]
+    lines = [one for one in axis.lines if one.get_color() == "white"]
+    assert [np.ptp(one.get_xdata()) * pixel_mm for one in lines] == pytest.approx([20] * drawn)
+    assert all(np.ptp(one.get_ydata()) == 0 for one in lines)
+    assert ("20 mm" in [text.get_text() for text in axis.texts]) == drawn
+
+
 def test_the_animation_at_rest_is_one_picture() -> None:
     frames = np.zeros((3, 20, 20, 3), np.uint8)
     frames[0, ..., 0], frames[1, ..., 1], frames[2, ..., 2] = 255, 255, 255
