@@ -19,12 +19,13 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.long_axis import (
     INDEPENDENT,
+    LEAST_AGREEMENT,
     NO_CROSSINGS,
     PLACE_MM,
     SEARCH_MM,
     Crossings,
     _at_phases,
-    _peak,
+    _place,
     find_crossings,
 )
 from pipeline.imaging.nifti import read_nifti_views, write_image
@@ -148,7 +149,7 @@ def test_views_in_nifti_have_their_own_timing(tmp_path: Path) -> None:
 
 
 SLICES, SIDE, SPACING_MM, MOMENTS = 9, 64, 2.0, 4
-BREATH_MM = (0.6, 2.2)
+BREATH_MM = (0.6, 2.2, 1.0)
 """Breath-holds differ along head and feet above all: here along the stack's rows."""
 
 TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -175,10 +176,12 @@ class Body:
 
 
 def image_of(body: Body, frame: Any, moved_mm: Any, noise: float, rng: Any) -> Any:
-    """Images ``(phase, row, column)`` of a body displaced by ``moved_mm``."""
+    """Images ``(phase, row, column)``, 8 mm thick, of a body displaced by ``moved_mm``."""
     y, x = np.mgrid[:SIDE, :SIDE]
     points_mm = x[..., None] * frame[:3, 0] + y[..., None] * frame[:3, 1] + frame[:3, 3] - moved_mm
-    images = np.stack([body.seen(points_mm, k / MOMENTS) for k in range(MOMENTS)])
+    normal = frame[:3, 2] / np.linalg.norm(frame[:3, 2])
+    through = points_mm + np.linspace(-4, 4, 5)[:, None, None, None] * normal
+    images = np.stack([body.seen(through, k / MOMENTS).mean(axis=0) for k in range(MOMENTS)])
     return images + noise * rng.standard_normal(images.shape)
 
 
@@ -202,21 +205,21 @@ def stack_and_views(seed: int, noise: float = 0.05) -> Any:
     rng = np.random.default_rng([seed, 1])
     body, phases = Body(seed), np.arange(MOMENTS) / MOMENTS
     frame = frame_of(*np.eye(3)[:2], np.zeros(3), 10.0)
-    slices_mm = np.pad(rng.normal(0, BREATH_MM, (SLICES, 2)), ((0, 0), (0, 1)))
+    slices_mm = rng.normal(0, BREATH_MM, (SLICES, 3))
     stack = [
         image_of(body, frame + np.outer([0, 0, 10.0 * z, 0], [0, 0, 0, 1]), moved, noise, rng)
         for z, moved in enumerate(slices_mm)
     ]
     intensity = np.stack(stack, axis=1).astype(np.float32)
     cine = Cine(intensity, turned(frame), phases, 0.8)
-    views, views_mm = [], np.pad(rng.normal(0, BREATH_MM, (3, 2)), ((0, 0), (0, 1)))
+    views, views_mm = [], rng.normal(0, BREATH_MM, (3, 3))
     for angle, moved in zip(np.radians([10, 70, 130]), views_mm, strict=True):
         across = np.array([np.cos(angle), np.sin(angle), 0])
         own = frame_of(across, np.array([0, 0, 1.0]), np.array([0, 0, 40.0]), 1.0)
         # Another gain and offset: nothing but the pattern is compared.
         image = 3 * image_of(body, own, moved, noise, rng) + 7
         views.append(Cine(image[:, None].astype(np.float32), turned(own), phases, 0.9))
-    return cine, views, slices_mm[:, :2], views_mm[:, :2]
+    return cine, views, slices_mm, views_mm
 
 
 def drawn_on(view: Any, shifts_mm: Any) -> Any:
@@ -230,9 +233,9 @@ def drawn_on(view: Any, shifts_mm: Any) -> Any:
 
 
 def in_view(view: Any, shifts_mm: Any) -> Any:
-    """Displacements along x and y of the body, as columns and rows of a view, apex first."""
-    flat = np.pad(shifts_mm, ((0, 0), (0, 1))) @ TURN.T @ view.axes[:2].T
-    return flat[list(view.order)] if len(shifts_mm) == len(view.order) else flat
+    """Displacements of the body along columns, rows and normal of a view, apex first."""
+    moved_mm = shifts_mm @ TURN.T @ view.axes.T
+    return moved_mm[list(view.order)] if len(shifts_mm) == len(view.order) else moved_mm
 
 
 def left_mm(shifts_mm: Any) -> float:
@@ -247,9 +250,9 @@ def test_crossings_tell_how_far_a_slice_lies_from_a_view() -> None:
     found = find_crossings(cine, views, view, drawn_on(view, ours))
     assert len(found.slices) > 0.8 * 3 * SLICES
     error_mm = found.offsets_mm - (ours[list(found.slices)] - theirs[list(found.views)])
-    # Linear interpolation on 2 mm pixels and steps of 1 mm: the peak of smooth values lies within
-    # half a step of a parabola's; both images are blurred alike.
-    assert np.sqrt(np.square(error_mm).mean()) < 0.5
+    # Linear interpolation on 2 mm pixels and steps of 1 mm; both images are blurred alike. Sums
+    # over steps tell a place to half a step.
+    assert (np.sqrt(np.square(error_mm).mean(axis=0)) < 0.5).all()
 
 
 def test_views_are_seen_at_the_stacks_phases_across_the_end_of_the_beat() -> None:
@@ -261,18 +264,23 @@ def test_views_are_seen_at_the_stacks_phases_across_the_end_of_the_beat() -> Non
     np.testing.assert_allclose(found, [20 - 20 / 3, 10, 25, 20 - 10 / 3], rtol=1e-6)
 
 
-def test_the_place_of_best_agreement_is_found_between_the_places_tried() -> None:
-    """Where the likelihood is a parabola, place and precision are those of the parabola."""
-    y, x = np.mgrid[-SEARCH_MM : SEARCH_MM + 1, -SEARCH_MM : SEARCH_MM + 1]
-    off = np.stack([x - 2.3, y + 4.4], axis=-1)
-    bend = np.array([[3.0, 0.8], [0.8, 1.5]])
+def test_the_place_of_agreement_is_the_likelihoods_mean() -> None:
+    """Where the likelihood is normal, place and covariance are those of the normal distribution."""
+    place_mm = np.array([2.3, -1.4, 0.6])
+    tried = np.arange(-SEARCH_MM, SEARCH_MM + 1)
+    off = np.stack(np.meshgrid(tried, tried, tried, indexing="ij"), axis=-1) - place_mm
+    bend = np.array([[0.9, 0.2, 0.1], [0.2, 0.7, -0.2], [0.1, -0.2, 0.8]])
     fall = np.einsum("...i,ij,...j->...", off, bend, off) / 2
     agreement = np.sqrt(np.clip(1 - np.exp((fall - 30) / (INDEPENDENT / 2)), 0, 1))
-    found = _peak(agreement)
+    found = _place(agreement)
     assert found is not None
-    np.testing.assert_allclose(found[0], [2.3, -4.4], atol=1e-6)
-    covariance = np.linalg.inv(bend) + PLACE_MM**2 * np.eye(2)
-    np.testing.assert_allclose(found[1], np.linalg.inv(covariance), rtol=1e-6)
+    # Sums over steps of one deviation leave exp(-2 pi^2), and agreement below 0 counts as none.
+    np.testing.assert_allclose(found[0], place_mm, atol=1e-6)
+    covariance = np.linalg.inv(bend) + np.diag(np.square(PLACE_MM))
+    np.testing.assert_allclose(found[1], covariance, atol=1e-5)
+    low = LEAST_AGREEMENT / agreement.max()
+    assert _place(0.99 * low * agreement) is None
+    assert _place(np.roll(agreement, SEARCH_MM - 2, axis=0)) is None
 
 
 def in_plane_mm(*given: Any) -> Any:
@@ -285,13 +293,17 @@ def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None
     view = view_of(cine)
     truth = in_view(view, slices_mm)
     drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
-    smooth = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes)
+    smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
     crossings = find_crossings(cine, views, view, drawn)
-    seen = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
-    assert left_mm(truth - smooth) < left_mm(truth)
+    seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
+    in_plane, normal = slice(0, 2), slice(2, 3)
+    assert left_mm((truth - smooth)[:, in_plane]) < left_mm(truth[:, in_plane])
     # Three lines a slice, each known to half a step (1 mm) of the search and better, leave
-    # 0.5 / sqrt(3) mm on either axis.
-    assert left_mm(truth - seen) < 0.5 * np.sqrt(2 / 3) < left_mm(truth - smooth)
+    # 0.5 / sqrt(3) mm on either axis; along the normal, where all is blurred, twice as much.
+    left_in_plane_mm = left_mm((truth - seen)[:, in_plane])
+    assert left_in_plane_mm < 0.5 * np.sqrt(2 / 3) < left_mm((truth - smooth)[:, in_plane])
+    assert left_mm((truth - seen)[:, normal]) < 1 / np.sqrt(3) < left_mm(truth[:, normal])
+    np.testing.assert_array_equal(smooth[:, normal], 0)
 
 
 @pytest.mark.parametrize("wrong", ["another body", "displaced"])
@@ -309,7 +321,7 @@ def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
         off = replace(views[0], mr_from_index=moved)
     crossings = find_crossings(cine, [off, *views[1:]], view, drawn)
     seen = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
-    assert left_mm(truth - seen) < left_mm(truth - smooth)
+    assert left_mm(truth[:, :2] - seen) < left_mm(truth[:, :2] - smooth)
 
 
 def test_a_view_that_contradicts_slices_and_views_is_left_out_of_the_equations() -> None:
@@ -343,8 +355,8 @@ def test_a_shift_seen_in_the_plane_tells_of_the_one_along_the_normal() -> None:
     axes = Rotation.from_euler("xyz", [50, 30, 20], degrees=True).as_matrix()
     covariance = axes @ np.diag(np.square(alignment.BREATH_MM)) @ axes.T
     shifts_mm = np.random.default_rng(8).multivariate_normal(np.zeros(3), covariance, count)
-    exact = np.tile(1e6 * np.eye(2), (count, 1, 1))
-    cut = Crossings(tuple(range(count)), (0,) * count, shifts_mm[:, :2], exact)
+    exact = np.tile(1e6 * np.diag([1.0, 1.0, 0.0]), (count, 1, 1))
+    cut = Crossings(tuple(range(count)), (0,) * count, shifts_mm, exact)
     nothing = np.zeros((1, count, 4, 4), np.uint8)
     # So far apart that no slice is held back.
     found_mm = slice_shifts_mm(nothing, PIXEL_MM, 100.0 * np.arange(count), axes, cut)

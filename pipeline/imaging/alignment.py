@@ -3,8 +3,8 @@
 Every slice is held in a breath of its own, and the heart lies elsewhere each time, mostly along
 head and feet. Tilt and slow curvature of the heart's axis are anatomy and stay; what jumps from
 slice to slice is taken for breathing. Long-axis views, where there are any, tell both apart. A
-breath moves the heart along one way more than along others, so a shift that views show in a
-slice's plane tells of the one along its normal, which shows in no image.
+breath moves the heart along one way more than along others, so a shift in a slice's plane tells of
+the one along its normal as well.
 """
 
 from __future__ import annotations
@@ -66,9 +66,8 @@ def slice_shifts_mm(
     The shifts are the most probable ones given normal curvature of the anatomy, normal shifts
     between breath-holds and, where there are long-axis views, how far each slice lies from each
     view: linear least squares, outliers weighted down (Cauchy's weights). Every view has a shift
-    of its own. What moves a slice along its normal is seen in neither: where a view cuts the slice
-    it is what the shift in the plane lets expect (mean of a normal distribution, given two of its
-    three components), elsewhere the shift is too uncertain to tell, and it is left.
+    of its own. Along its normal a slice is moved where a view cuts it; elsewhere the shift is too
+    uncertain to tell, and it is left.
     Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
@@ -95,17 +94,16 @@ def slice_shifts_mm(
     if not len(bends.offsets_mm) and not crossings.slices:
         return np.zeros((len(heights_mm), 3))
     # The breathing ellipsoid is what is known of a shift beforehand.
-    covariance = axes @ np.diag(np.square(BREATH_MM)) @ axes.T
-    of_a_slice = np.linalg.inv(covariance[:2, :2])
+    of_a_slice = axes @ np.diag(1 / np.square(BREATH_MM)) @ axes.T
     while True:
         known = _joined(bends, _equations(crossings, len(heights_mm)))
         shifts_mm, left = _solved(known, of_a_slice, len(heights_mm))
         doubted = _doubted_view(crossings, left[len(bends.offsets_mm) :])
         if doubted is None:
             most_mm = LARGEST_NORMAL * np.diff(heights_mm).min()
-            normal_mm = np.clip(shifts_mm @ of_a_slice @ covariance[:2, 2], -most_mm, most_mm)
             cut = np.isin(np.arange(len(heights_mm)), crossings.slices)
-            return np.column_stack([shifts_mm, np.where(cut, normal_mm, 0)])
+            shifts_mm[:, 2] = np.where(cut, np.clip(shifts_mm[:, 2], -most_mm, most_mm), 0)
+            return shifts_mm
         crossings = crossings.without(doubted)
 
 
@@ -114,13 +112,13 @@ class _Equations:
     """Linear equations for the shifts of slices and views."""
 
     matrix: Float
-    """``(n, slice + view)``, the same for both directions."""
+    """``(n, slice + view)``, the same for all directions."""
 
     offsets_mm: Float
-    """``(n, 2)``."""
+    """``(n, 3)``."""
 
     precision: Float
-    """``(n, 2, 2)`` inverse covariance, 1/mm2."""
+    """``(n, 3, 3)`` inverse covariance, 1/mm2."""
 
 
 def _joined(bends: _Equations, seen: _Equations) -> _Equations:
@@ -142,19 +140,19 @@ def _equations(crossings: Crossings, slices: int) -> _Equations:
 
 
 def _solved(known: _Equations, of_a_slice: Float, slices: int) -> tuple[Float, Float]:
-    """Shifts ``(slice, 2)``, and how many deviations each equation is off, ``(n,)``."""
+    """Shifts ``(slice, 3)``, and how many deviations each equation is off, ``(n,)``."""
     count = known.matrix.shape[1]
-    prior = np.kron(np.eye(count), np.eye(2) / VIEW_MM**2)
-    prior[: 2 * slices, : 2 * slices] = np.kron(np.eye(slices), of_a_slice)
-    shifts_mm = np.zeros((count, 2))
+    prior = np.kron(np.eye(count), np.eye(3) / VIEW_MM**2)
+    prior[: 3 * slices, : 3 * slices] = np.kron(np.eye(slices), of_a_slice)
+    shifts_mm = np.zeros((count, 3))
     for _ in range(ROUNDS):
         left_mm = known.offsets_mm - known.matrix @ shifts_mm
         left = np.sqrt(np.einsum("ni,nij,nj->n", left_mm, known.precision, left_mm))
         weight = known.precision / (1 + (left / OUTLIER) ** 2)[:, None, None]
-        normal = np.einsum("na,nij,nb->aibj", known.matrix, weight, known.matrix)
+        normal = np.einsum("na,nij,nb->aibj", known.matrix, weight, known.matrix, optimize=True)
         right = np.einsum("na,nij,nj->ai", known.matrix, weight, known.offsets_mm)
-        both = normal.reshape(2 * count, 2 * count) + prior
-        shifts_mm = np.linalg.solve(both, right.ravel()).reshape(count, 2)
+        both = normal.reshape(3 * count, 3 * count) + prior
+        shifts_mm = np.linalg.solve(both, right.ravel()).reshape(count, 3)
     return shifts_mm[:slices], left
 
 
@@ -182,11 +180,10 @@ def _observations(labels: Label, pixel_mm: float, heights_mm: Float) -> _Equatio
             bends_mm.append(found_mm[middle])
             # A smooth axis leaves the chord by half its curvature times both parts of the chord.
             deviations_mm.append(deviation_mm * before_mm * after_mm / 10.0**2)
-    precision = np.array([np.eye(2) / deviation**2 for deviation in deviations_mm])
+    in_plane = np.pad(np.array(bends_mm).reshape(-1, 2), ((0, 0), (0, 1)))
+    precision = np.array([np.diag([1.0, 1.0, 0.0]) / deviation**2 for deviation in deviations_mm])
     return _Equations(
-        np.array(rows).reshape(-1, labels.shape[1]),
-        np.array(bends_mm).reshape(-1, 2),
-        precision.reshape(-1, 2, 2),
+        np.array(rows).reshape(-1, labels.shape[1]), in_plane, precision.reshape(-1, 3, 3)
     )
 
 

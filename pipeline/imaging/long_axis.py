@@ -2,10 +2,11 @@
 
 Every slice and every view is held in a breath of its own. Where a view's plane cuts a slice, both
 show the same line through the heart at every moment of the beat; how far the slice must be moved
-in its plane until the grey values along the line agree is how far its breath-hold was from the
-view's. Agreement along lines of intersection, over all phases: Slomka et al., J. Magn. Reson.
-Imaging 25(5):965-973, 2007; IEEE Trans. Med. Imaging 29(3):868-878, 2010. What moves a slice along
-its normal is not found here: it shows in no single slice.
+until the grey values along the line agree is how far its breath-hold was from the view's. In its
+plane it is moved over the view's line; along its normal, which shows in no slice by itself, it is
+compared with other lines of the view, above and below. Agreement along lines of intersection, over
+all phases: Slomka et al., J. Magn. Reson. Imaging 25(5):965-973, 2007; IEEE Trans. Med. Imaging
+29(3):868-878, 2010.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ STEP_MM = 1.0
 """Distance of the points along a line of intersection, and of the shifts tried."""
 
 SEARCH_MM = 10
-"""Largest shift tried, along the line and across it."""
+"""Largest shift tried, along the line, across it and along the slice's normal."""
 
-BLUR_MM = 6
+BLUR_MM = 8
 """Slices are some 8 mm thick: along each image's own plane the other one is blurred by this much,
 so that both show the same mean."""
 
@@ -43,11 +44,12 @@ LEAST_AGREEMENT = 0.6
 MOST_PHASES = 8
 """Moments that are compared; the others tell next to nothing more."""
 
-INDEPENDENT = 60.0
+INDEPENDENT = 20.0
 """Grey values along a line over all phases that can be counted as independent of one another."""
 
-PLACE_MM = 0.5
-"""Standard deviation of a place found, however sharp the agreement: inflow, thickness, tilt."""
+PLACE_MM = (0.3, 0.4, 0.6)
+"""Standard deviation of a place found, however sharp the agreement (inflow, thickness, tilt): along
+the line, across it in the slice, across it in the view."""
 
 LEAST_STEP_MM = 4.0
 """Slices nearer to one another are parts of one volume, with no breath-holds of their own."""
@@ -55,7 +57,7 @@ LEAST_STEP_MM = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Crossings:
-    """How far slices lie from views, in the slices' plane."""
+    """How far slices lie from views."""
 
     slices: tuple[int, ...]
     """Number of the slice of each measurement, from the apex; interpolated ones do not count."""
@@ -64,10 +66,10 @@ class Crossings:
     """Number of the view of each."""
 
     offsets_mm: Float
-    """``(n, 2)`` shift of the slice less that of the view, along columns and rows."""
+    """``(n, 3)`` shift of the slice less that of the view, along columns, rows and normal."""
 
     precision: Float
-    """``(n, 2, 2)`` inverse covariance, 1/mm2."""
+    """``(n, 3, 3)`` inverse covariance, 1/mm2."""
 
     def without(self, view: int) -> Crossings:
         """All but those of one view."""
@@ -80,7 +82,7 @@ class Crossings:
         )
 
 
-NO_CROSSINGS = Crossings((), (), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+NO_CROSSINGS = Crossings((), (), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
 def find_crossings(cine: Cine, views: Sequence[Cine], view: View, drawn: Label) -> Crossings:
@@ -112,10 +114,12 @@ def find_crossings(cine: Cine, views: Sequence[Cine], view: View, drawn: Label) 
             line = _line(cine, other, view, number, heart_mm)
             found = None if line is None else _compare(cine, other, line, view.order[number])
             if line is not None and found is not None:
+                # Slice and view show one place where they are moved apart by what the axes sum to.
+                axes = view.axes @ (line.axes * (1, 1, -1))
                 slices.append(place)
                 numbers.append(k)
-                offsets_mm.append(line.in_plane.T @ found[0])
-                precision.append(line.in_plane.T @ found[1] @ line.in_plane)
+                offsets_mm.append(axes @ found[0])
+                precision.append(np.linalg.inv(axes @ found[1] @ axes.T))
     if not slices:
         return NO_CROSSINGS
     return Crossings(tuple(slices), tuple(numbers), np.array(offsets_mm), np.array(precision))
@@ -129,10 +133,8 @@ class _Line:
     """``(n, 3)`` LPS, `STEP_MM` apart."""
 
     axes: Float
-    """``(3, 3)`` rows, LPS: along the line, across it in the slice, along the slice's normal."""
-
-    in_plane: Float
-    """``(2, 2)`` rows: along the line and across it, in columns and rows of the slice."""
+    """``(3, 3)`` columns, LPS: along the line, across it in the slice, across it in the view
+    towards the base."""
 
 
 def _heart_mm(drawn: Label, pixel_mm: float) -> Float:
@@ -163,29 +165,35 @@ def _line(cine: Cine, other: Cine, view: View, number: int, heart_mm: Float) -> 
         return None
     t_mm = np.arange(places_mm.min() - AROUND_MM, places_mm.max() + AROUND_MM, STEP_MM)
     flat_mm = away_mm * inside + t_mm[:, None] * along
-    axes = np.stack([along @ view.axes[:2], inside @ view.axes[:2], normal])
-    return _Line(corner_mm + flat_mm @ view.axes[:2], axes, np.stack([along, inside]))
+    line = along @ view.axes[:2]
+    up = np.cross(across, line)
+    up *= np.sign(up @ normal)
+    axes = np.stack([line, inside @ view.axes[:2], up], axis=1)
+    return _Line(corner_mm + flat_mm @ view.axes[:2], axes)
 
 
 def _compare(cine: Cine, other: Cine, line: _Line, z: int) -> tuple[Float, Float] | None:
-    """Shift ``(2,)`` along and across the line at which both agree best, and its precision."""
+    """How far ``(3,)`` slice and view are moved along the line's axes where both agree best.
+
+    With its covariance ``(3, 3)``; None where they agree nowhere clearly.
+    """
     chosen = np.unique(np.linspace(0, len(cine.phases) - 1, MOST_PHASES).round().astype(int))
     theirs = _profiles(other, line, cine.phases[chosen])
     ours = _slice_patches(cine, line, z, chosen)
-    valid: Mask = np.asarray(np.isfinite(theirs).all(axis=0))
+    valid: Mask = np.asarray(np.isfinite(theirs).all(axis=(0, 1)))
     if valid.sum() * STEP_MM < LEAST_LINE_MM or not np.isfinite(ours).all():
         return None
-    agreement = _agreement(ours, theirs, valid)
-    return _peak(agreement)
+    return _place(_agreement(ours, theirs[..., valid], valid))
 
 
 def _profiles(other: Cine, line: _Line, phases: Float) -> Float:
-    """Grey values of a view along the line at the stack's phases: ``(phase, n)``."""
-    offsets_mm = np.arange(-BLUR_MM / 2, BLUR_MM / 2 + 0.5)[:, None, None] * line.axes[2]
+    """Grey values of a view along lines beside one another: ``(phase, 2 SEARCH_MM + 1, n)``."""
+    reach = SEARCH_MM + BLUR_MM // 2
+    offsets_mm = np.arange(-reach, reach + 1)[:, None, None] * line.axes[:, 2]
     images = _at_phases(other, phases)
     points_mm = line.points_mm + offsets_mm
     values = np.stack([_sampled(image, other.mr_from_index, points_mm) for image in images])
-    return np.asarray(values.mean(axis=1))
+    return np.asarray(sliding_window_view(values, BLUR_MM + 1, axis=1).mean(axis=-1))
 
 
 def _at_phases(other: Cine, phases: Float) -> Float32:
@@ -202,9 +210,9 @@ def _at_phases(other: Cine, phases: Float) -> Float32:
 def _slice_patches(cine: Cine, line: _Line, z: int, chosen: Integer) -> Float:
     """Grey values of a slice about the line: ``(phase, across, along)``, `SEARCH_MM` beyond it."""
     reach = SEARCH_MM + BLUR_MM // 2
-    before = line.points_mm[0] - SEARCH_MM * line.axes[0]
-    along = np.arange(len(line.points_mm) + 2 * SEARCH_MM)[None, :, None] * line.axes[0]
-    across = np.arange(-reach, reach + 1)[:, None, None] * line.axes[1]
+    before = line.points_mm[0] - SEARCH_MM * line.axes[:, 0]
+    along = np.arange(len(line.points_mm) + 2 * SEARCH_MM)[None, :, None] * line.axes[:, 0]
+    across = np.arange(-reach, reach + 1)[:, None, None] * line.axes[:, 1]
     mr_from_index = cine.mr_from_index.copy()
     mr_from_index[:3, 3] += z * mr_from_index[:3, 2]
     patches = np.stack(
@@ -225,37 +233,31 @@ def _sampled(image: Float32, mr_from_index: Float, points_mm: Float) -> Float:
 
 
 def _agreement(ours: Float, theirs: Float, valid: Mask) -> Float:
-    """Correlation of both over phases and points for every shift: ``(across, along)``."""
-    windows: Float = sliding_window_view(ours, theirs.shape[1], axis=2)[..., valid]
-    model = theirs[:, valid] - theirs[:, valid].mean()
+    """Correlation of both over phases and points for every shift: ``(along, across, up)``."""
+    windows: Float = sliding_window_view(ours, len(valid), axis=2)[..., valid]
+    model = theirs - theirs.mean(axis=(0, 2), keepdims=True)
     mean = windows.mean(axis=(0, 3))
     power = np.square(windows).mean(axis=(0, 3)) - mean**2
-    product = np.einsum("patn,pn->at", windows, model) / model.size
-    scale = np.sqrt(np.maximum(power * np.square(model).mean(), 1e-12))
-    return np.asarray(product / scale)
+    product = np.einsum("patn,pun->tau", windows, model, optimize=True) / model[:, 0].size
+    scale = power.T[..., None] * np.square(model).mean(axis=(0, 2))
+    return np.asarray(product / np.sqrt(np.maximum(scale, 1e-12)))
 
 
-def _peak(agreement: Float) -> tuple[Float, Float] | None:
-    """Place of the best agreement, (along, across), mm, and the precision with which it is known.
+def _place(agreement: Float) -> tuple[Float, Float] | None:
+    """Where slice and view agree, (along, across, up), mm, and its covariance.
 
-    The likelihood of correlated normal values falls as ``(1 - r^2)^(n/2)``; a parabola through
-    the eight neighbours of its peak gives the precision.
+    The likelihood of correlated normal values falls as ``(1 - r^2)^(n/2)``; its mean and covariance
+    over all shifts that were tried tell more truly than the shape of its peak where there are
+    several, as about the tip. None where the peak is low, or at the end of what was tried.
     """
-    row, column = np.unravel_index(agreement.argmax(), agreement.shape)
-    last = 2 * SEARCH_MM
-    if agreement[row, column] < LEAST_AGREEMENT or not (0 < row < last and 0 < column < last):
+    peak = np.unravel_index(agreement.argmax(), agreement.shape)
+    if agreement[peak] < LEAST_AGREEMENT or not all(0 < k < 2 * SEARCH_MM for k in peak):
         return None
-    near = agreement[row - 1 : row + 2, column - 1 : column + 2]
-    chance = INDEPENDENT / 2 * np.log(np.maximum(1 - np.clip(near, 0, 1) ** 2, 1e-6))
-    gradient = np.array([chance[1, 2] - chance[1, 0], chance[2, 1] - chance[0, 1]]) / 2
-    mixed = (chance[2, 2] - chance[2, 0] - chance[0, 2] + chance[0, 0]) / 4
-    along = chance[1, 2] + chance[1, 0] - 2 * chance[1, 1]
-    across = chance[2, 1] + chance[0, 1] - 2 * chance[1, 1]
-    bend = np.array([[along, mixed], [mixed, across]])
-    if np.linalg.eigvalsh(bend)[0] <= 1e-3:
-        return None
-    spread = np.linalg.inv(bend)
-    refined = np.clip(-spread @ gradient, -1, 1)
-    place = np.array([column - SEARCH_MM, row - SEARCH_MM]) + refined
-    precision: Float = np.asarray(np.linalg.inv(spread + PLACE_MM**2 * np.eye(2)), float)
-    return STEP_MM * place, precision
+    misfit = np.log(np.maximum(1 - np.clip(agreement, 0, 1) ** 2, 1e-6))
+    chance = np.exp(-INDEPENDENT / 2 * (misfit - misfit.min()))
+    chance /= chance.sum()
+    tried = STEP_MM * (np.indices(agreement.shape) - SEARCH_MM).reshape(3, -1)
+    mean = tried @ chance.ravel()
+    away = tried - mean[:, None]
+    covariance = (away * chance.ravel()) @ away.T + np.diag(np.square(PLACE_MM))
+    return mean, covariance
