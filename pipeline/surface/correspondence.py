@@ -95,11 +95,10 @@ def make_smoother(stiffness: sparse.csr_array, reach_edges: float) -> Smoother:
     shrink = (np.sqrt(top) - 1) / (np.sqrt(top) + 1)
     rounds = int(np.ceil(np.log(SMOOTHER_ERROR / 2) / np.log(shrink)))
     matrix = sparse.csr_array(sparse.eye_array(stiffness.shape[0]) + reach_edges**2 * stiffness)
+    starts, neighbours = matrix.indptr.astype(np.uint64), matrix.indices.astype(np.uint64)
 
     def smooth(values: Float) -> Float:
-        found: Float = chebyshev(
-            matrix.indptr, matrix.indices, matrix.data, values, centre, radius, rounds
-        )
+        found: Float = chebyshev(starts, neighbours, matrix.data, values, centre, radius, rounds)
         return found
 
     return smooth

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.geometry import Float, Integer, Mask
+from pipeline.surface.kernels import face_normal
 
 # Volumes below this share of a cell are rounding: what lies in one plane only touches.
 ROUNDING = 1e-10
@@ -66,42 +67,64 @@ def _crossings(vertices, triangles, low, high, starts, members, tiny):  # type: 
     for cell in range(len(starts) - 1):
         for at in range(starts[cell], starts[cell + 1]):
             s = members[at]
+            low_x, low_y, low_z = low[s, 0], low[s, 1], low[s, 2]
+            high_x, high_y, high_z = high[s, 0], high[s, 1], high[s, 2]
             for beside in range(at + 1, starts[cell + 1]):
                 t = members[beside]
-                apart = False
-                for axis in range(3):
-                    apart |= low[s, axis] > high[t, axis] or low[t, axis] > high[s, axis]
-                if apart or (crossing[s] and crossing[t]):
+                if (
+                    low_x > high[t, 0]
+                    or low[t, 0] > high_x
+                    or low_y > high[t, 1]
+                    or low[t, 1] > high_y
+                    or low_z > high[t, 2]
+                    or low[t, 2] > high_z
+                    or (crossing[s] and crossing[t])
+                ):
                     continue
-                one, other = triangles[s], triangles[t]
-                if _pierces(vertices, one, other, tiny) or _pierces(vertices, other, one, tiny):
+                if _pierces(vertices, triangles, s, t, tiny) or _pierces(
+                    vertices, triangles, t, s, tiny
+                ):
                     crossing[s] = crossing[t] = True
     return crossing
 
 
 @njit(nogil=True, cache=True)
-def _pierces(vertices, one, other, tiny):  # type: ignore[no-untyped-def]
+def _pierces(v, triangles, one, other, tiny):  # type: ignore[no-untyped-def]
     """Whether an edge of one triangle passes through another with which it shares no vertex."""
-    a, b, c = other
-    for corner in range(3):
-        p, q = one[corner], one[(corner + 1) % 3]
-        if p in (a, b, c) or q in (a, b, c):
-            continue
-        above, below = _side(vertices, a, b, c, p), _side(vertices, a, b, c, q)
-        if min(above, below) > -tiny or max(above, below) < tiny:
-            continue
-        first = _side(vertices, p, q, a, b)
-        second = _side(vertices, p, q, b, c)
-        third = _side(vertices, p, q, c, a)
-        if min(first, second, third) > tiny or max(first, second, third) < -tiny:
-            return True
-    return False
+    a, b, c = triangles[other, 0], triangles[other, 1], triangles[other, 2]
+    p, q, r = triangles[one, 0], triangles[one, 1], triangles[one, 2]
+    normal = face_normal(v, a, b, c)
+    # Nearly all triangles that are near lie on one side.
+    at_p, at_q = _height(v, a, p, normal), _height(v, a, q, normal)
+    at_r = _height(v, a, r, normal)
+    if min(at_p, at_q, at_r) > -tiny or max(at_p, at_q, at_r) < tiny:
+        return False
+    return (
+        _passes(v, p, q, at_p, at_q, a, b, c, tiny)
+        or _passes(v, q, r, at_q, at_r, a, b, c, tiny)
+        or _passes(v, r, p, at_r, at_p, a, b, c, tiny)
+    )
 
 
 @njit(nogil=True, cache=True)
-def _side(v, a, b, c, d):  # type: ignore[no-untyped-def]
+def _passes(v, p, q, above, below, a, b, c, tiny):  # type: ignore[no-untyped-def]
+    """Whether the edge from p to q, which are so high above a, b, c, passes through between."""
+    if p in (a, b, c) or q in (a, b, c):
+        return False
+    if min(above, below) > -tiny or max(above, below) < tiny:
+        return False
+    first, second, third = _side(v, p, q, a, b), _side(v, p, q, b, c), _side(v, p, q, c, a)
+    return min(first, second, third) > tiny or max(first, second, third) < -tiny
+
+
+@njit(nogil=True, cache=True)
+def _side(vertices, a, b, c, d):  # type: ignore[no-untyped-def]
     """Six times the signed volume of the tetrahedron a, b, c, d."""
-    ux, uy, uz = v[b, 0] - v[a, 0], v[b, 1] - v[a, 1], v[b, 2] - v[a, 2]
-    wx, wy, wz = v[c, 0] - v[a, 0], v[c, 1] - v[a, 1], v[c, 2] - v[a, 2]
-    x, y, z = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    return _height(vertices, a, d, face_normal(vertices, a, b, c))
+
+
+@njit(nogil=True, cache=True)
+def _height(v, a, d, normal):  # type: ignore[no-untyped-def]
+    """How far d is above a, times the length of the normal."""
+    x, y, z = normal
     return x * (v[d, 0] - v[a, 0]) + y * (v[d, 1] - v[a, 1]) + z * (v[d, 2] - v[a, 2])

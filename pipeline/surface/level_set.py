@@ -58,10 +58,11 @@ def smooth_level_set(mask: Mask, spacing_mm: float, smoothing_voxels: float) -> 
     """
     solid = mask.astype(np.float32)
     blurred = ndimage.gaussian_filter(solid, smoothing_voxels, truncate=4.0)
-    near = -smoothing_voxels * special.ndtri(np.clip(blurred, 1e-6, 1 - 1e-6))
     far = euclidean_voxels(mask)
     weight = np.clip((np.abs(far) / smoothing_voxels - NEAR) / (FAR - NEAR), 0, 1)
-    distance = (1 - weight) * near + weight * far
+    distance, close = far.copy(), weight < 1
+    near = -smoothing_voxels * special.ndtri(np.clip(blurred[close], 1e-6, 1 - 1e-6))
+    distance[close] = (1 - weight[close]) * near + weight[close] * far[close]
     distance = 2 * distance - ndimage.gaussian_filter(distance, smoothing_voxels, truncate=4.0)
     distance -= volume_shift(distance, float(np.count_nonzero(mask)))
     return LevelSet((distance * spacing_mm).astype(np.float32), spacing_mm)
@@ -116,7 +117,7 @@ def _away_mm(way: Float, shape: tuple[int, ...], spacing_mm: float) -> Float32:
     return np.asarray(spacing_mm * away.reshape(shape), np.float32)
 
 
-def volume_shift(distance_voxels: Float, volume_voxels: float) -> float:
+def volume_shift(distance_voxels: Float | Float32, volume_voxels: float) -> float:
     """Level of a signed distance (voxels) that encloses a volume (voxels), found by Newton.
 
     A voxel counts as filled in the measure in which the level passes it: clip(1/2 - d, 0, 1).
