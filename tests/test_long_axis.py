@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from cine_files import PHASES, RR_MS, dicom_frame, in_series, write_dicom
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
 from pipeline.imaging import alignment
-from pipeline.imaging.alignment import slice_shifts_mm
+from pipeline.imaging.alignment import _in_order, slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.long_axis import (
@@ -359,21 +360,40 @@ def test_a_shift_seen_in_the_plane_tells_of_the_one_along_the_normal() -> None:
     cut = Crossings(tuple(range(count)), (0,) * count, shifts_mm, exact)
     nothing = np.zeros((1, count, 4, 4), np.uint8)
     # So far apart that no slice is held back.
-    found_mm = slice_shifts_mm(nothing, PIXEL_MM, 100.0 * np.arange(count), axes, cut)
+    far_mm = 100.0 * np.arange(count)
+    found_mm = slice_shifts_mm(nothing, PIXEL_MM, far_mm, axes, cut)
     left_mm = found_mm[:, 2] - shifts_mm[:, 2]
     given = covariance[2, :2] @ np.linalg.inv(covariance[:2, :2]) @ covariance[:2, 2]
     expected = covariance[2, 2] - given
     assert expected < 0.5 * covariance[2, 2]
     # Four standard deviations of a variance's estimate.
     assert left_mm.var() == pytest.approx(expected, rel=4 * np.sqrt(2 / count))
-    # Near to one another, they keep their order.
-    near_mm = 5.0 * np.arange(count)
-    moved_mm = slice_shifts_mm(nothing, PIXEL_MM, near_mm, axes, cut)[:, 2]
-    assert np.abs(moved_mm).max() == 5.0 / 4
-    assert np.diff(near_mm - moved_mm).min() >= 5.0 / 2
     # Slices that no view cuts stay at their height.
     half = replace(cut.without(0), slices=cut.slices[::2], views=cut.views[::2])
     half = replace(half, offsets_mm=cut.offsets_mm[::2], precision=exact[::2])
-    alone_mm = slice_shifts_mm(nothing, PIXEL_MM, near_mm, axes, half)
+    alone_mm = slice_shifts_mm(nothing, PIXEL_MM, far_mm, axes, half)
     assert alone_mm[::2, 2].any()
     assert not alone_mm[1::2, 2].any()
+    # Near to one another, they keep their order, and half of their distance.
+    near_mm = 5.0 * np.arange(count)
+    moved_mm = slice_shifts_mm(nothing, PIXEL_MM, near_mm, axes, cut)[:, 2]
+    assert np.diff(near_mm - found_mm[:, 2]).min() < 0
+    assert np.diff(near_mm - moved_mm).min() == pytest.approx(2.5, abs=1e-5)
+
+
+def test_slices_that_would_change_places_move_as_little_as_keeps_them_apart() -> None:
+    heights_mm = 5.0 * np.arange(20)
+    given_mm = np.random.default_rng(9).normal(0, 4, 20)
+
+    def off_mm(gaps_mm: Any) -> Any:
+        """How far places with these gaps lie from those given, where their mean is best."""
+        away_mm = np.concatenate([[0], np.cumsum(gaps_mm)]) - (heights_mm - given_mm)
+        return away_mm - away_mm.mean()
+
+    # The least squares that such places leave, by a general solver.
+    start = np.full(19, 5.0)
+    best = minimize(lambda gaps: np.square(off_mm(gaps)).sum(), start, bounds=[(2.5, None)] * 19)
+    assert best.success
+    assert best.fun > 10
+    left_mm = _in_order(heights_mm, given_mm) - given_mm
+    np.testing.assert_allclose(left_mm, -off_mm(best.x), atol=1e-2)

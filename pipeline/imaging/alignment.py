@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from pipeline.geometry import Float, Label, Mask
 from pipeline.imaging.labels import LABELS
@@ -45,9 +46,9 @@ LEAST_AREA_MM2 = 150.0
 VIEW_MM = 6.0
 """Standard deviation of a long-axis view's place: a breath-hold, or a patient who has moved."""
 
-LARGEST_NORMAL = 0.25
-"""Of the distance between slices: how far one may be moved along its normal. Two neighbours never
-come nearer to one another than half of it."""
+LEAST_GAP = 0.5
+"""Of the distance between slices: two neighbours that are moved along their normal come no nearer
+to one another."""
 
 TRUSTED = 3.0
 """A view is voted out when more than a third of its lines lie farther off what all say, in
@@ -100,12 +101,18 @@ def slice_shifts_mm(
         shifts_mm, left = _solved(known, of_a_slice, len(heights_mm))
         doubted = _doubted_view(crossings, left[len(bends.offsets_mm) :])
         if doubted is None:
-            most_mm = LARGEST_NORMAL * np.diff(heights_mm).min()
             cut = np.isin(np.arange(len(heights_mm)), crossings.slices)
-            shifts_mm[:, 2] = np.where(cut, np.clip(shifts_mm[:, 2], -most_mm, most_mm), 0)
+            shifts_mm[:, 2] = _in_order(heights_mm, np.where(cut, shifts_mm[:, 2], 0))
             # Products by BLAS differ in their last digits with the number of processors.
             return np.round(shifts_mm, 6)
         crossings = crossings.without(doubted)
+
+
+def _in_order(heights_mm: Float, normal_mm: Float) -> Float:
+    """The shifts ``(slice,)`` nearest to those given that keep `LEAST_GAP` between neighbours."""
+    least_mm = np.concatenate([[0], np.cumsum(LEAST_GAP * np.diff(heights_mm))])
+    above_mm = isotonic_regression(heights_mm - normal_mm - least_mm).x
+    return np.asarray(heights_mm - least_mm - above_mm)
 
 
 @dataclass(frozen=True, slots=True)
