@@ -1,10 +1,11 @@
 """How well phantoms that nobody trained on are segmented, and how truly their surfaces move.
 
     python benchmarks/segmentation_figures.py OUT [--patients 20] [--phases 6] [--seed 701]
-        [--workers 2] [--config FILE] [--long-axis] [--redraw]
+        [--workers 2] [--config FILE] [--long-axis] [--breath-holds 1.5] [--redraw]
 
 Writes cine-only studies, one seed each: every pathology in turn, signal-to-noise ratios spread
-over 10 to 40; ``--long-axis`` adds the 2-, 3- and 4-chamber views. Runs the pipeline on each until
+over 10 to 40; ``--long-axis`` adds the 2-, 3- and 4-chamber views, ``--breath-holds 0`` draws all
+slices and views in one place. Runs the pipeline on each until
 evaluate, and prints, as Markdown, each patient, each structure, what was asked and whether it is
 reached, and how wrong slices of low confidence are. It goes on where it was interrupted: studies
 that are there are used again unless they were drawn with other settings (``--redraw`` draws all
@@ -64,6 +65,9 @@ class Order:
     long_axis: bool = False
     """With 2-, 3- and 4-chamber views beside the stack."""
 
+    breath_holds_mm: float = 1.5
+    """Standard deviation of the heart's place from one breath-hold to another."""
+
     @property
     def pathology(self) -> str:
         """Every one in turn."""
@@ -85,7 +89,10 @@ class Order:
         changes = {
             "seed": self.seed + self.number, "pathology": self.pathology, "patient_id": self.name,
             "cine_only": True, "long_axis": self.long_axis,
-            "mr": {"phases": self.phases, "snr": self.snr},
+            "mr": {
+                "phases": self.phases, "snr": self.snr,
+                "breath_hold_shift_mm": self.breath_holds_mm,
+            },
         }  # fmt: skip
         return read_settings(None, changes)
 
@@ -171,14 +178,15 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--config", type=Path, help="settings of the pipeline")
     parser.add_argument("--long-axis", action="store_true", help="with long-axis views")
+    parser.add_argument(
+        "--breath-holds", type=float, default=1.5, metavar="MM", help="apart by this"
+    )
     parser.add_argument("--redraw", action="store_true", help="draw all studies anew")
     options = parser.parse_args()
     begun = time.perf_counter()
     write_settings(options.out, options.config)
-    orders = [
-        Order(options.out, number, options.seed, options.phases, options.redraw, options.long_axis)
-        for number in range(options.patients)
-    ]
+    of_all = (options.seed, options.phases, options.redraw, options.long_axis, options.breath_holds)
+    orders = [Order(options.out, number, *of_all) for number in range(options.patients)]
     patients = measure_all(orders, options.workers)
     print("\n" + report(patients))
     print(f"\n{len(patients)} patients in {time.perf_counter() - begun:.0f} s")
