@@ -68,7 +68,7 @@ def slice_shifts_mm(
     between breath-holds and, where there are long-axis views, how far each slice lies from each
     view: linear least squares, outliers weighted down (Cauchy's weights). Every view has a shift
     of its own. Along its normal a slice is moved where a view cuts it; elsewhere the shift is too
-    uncertain to tell, and it is left.
+    uncertain to tell, and it is left but for what keeps it apart from its neighbours.
     Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
