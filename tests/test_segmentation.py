@@ -20,7 +20,6 @@ from pipeline.errors import InputError, StageError
 from pipeline.imaging import view
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_probability
-from pipeline.imaging.inference import blend_phases
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.network import WEIGHTS, neighbour_steps, neighbours, normalise
 from pipeline.imaging.segmentation import segment_cine
@@ -367,13 +366,6 @@ def test_cleaning_keeps_probabilities_and_leaves_empty_images_alone():
     np.testing.assert_allclose(cleaned.sum(axis=1), 1, atol=1e-5)
     nothing = one_hot(np.zeros((2, 8, 8), int))
     np.testing.assert_array_equal(clean_probability(nothing, view.PIXEL_MM), nothing)
-
-
-def test_blending_is_cyclic_and_keeps_the_sum():
-    value = np.zeros((4, 1, 1, 1, 1), np.float32)
-    value[0] = 1
-    blend_phases(value, 0.25)
-    np.testing.assert_array_equal(value.ravel(), [0.5, 0.25, 0, 0.25])
 
 
 @pytest.mark.parametrize(("neck", "joined"), [(0.4, True), (0.02, False)])

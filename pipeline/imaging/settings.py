@@ -17,9 +17,9 @@ class SegmentSettings(BaseModel):
     """In how many ways, each turned a little otherwise, the network is shown each image; the more
     images a study has, the fewer, so that the time stays about the same."""
 
-    phase_blend: float = Field(0.15, ge=0, le=1 / 3)
-    """Share that each neighbouring phase has in a phase's probabilities at 25 phases a beat; with
-    fewer, the share falls as the square of their distance grows, as does what it blurs."""
+    phase_blend: float = Field(0.25, ge=0, le=0.25)
+    """How much phases are mixed with their neighbours at 25 phases a beat, as the share that either
+    would have in a plain mean; with fewer, it falls as the square of their distance grows."""
 
     min_confidence: float = Field(0.4, ge=0, le=1)
     """An image whose labels are trusted less counts as not understood and fails the stage."""
