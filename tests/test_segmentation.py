@@ -207,6 +207,20 @@ def test_empty_images_are_refused_as_no_heart(study):
         segment_cine(replace(cine, intensity=np.zeros_like(cine.intensity)), QUICK)
 
 
+def test_every_empty_slice_is_named_and_only_inner_ones_are_to_be_redrawn(study):
+    cine = study[1]
+    last = cine.intensity.shape[1] - 1
+    empty = cine.intensity.copy()
+    empty[:, [0, last]] = 0
+    with pytest.raises(StageError) as ends:
+        segment_cine(replace(cine, intensity=empty), QUICK)
+    assert f"leave slice 0, {last}, at an end" in str(ends.value)
+    assert "spoilt_slices" not in str(ends.value)
+    empty[1, 3] = 7
+    with pytest.raises(StageError, match=rf"slice 0, {last}, at .*spoilt_slices: \[3\]"):
+        segment_cine(replace(cine, intensity=empty), QUICK)
+
+
 def test_a_single_spoilt_image_is_named(study):
     cine = study[1]
     images = cine.intensity.copy()

@@ -126,7 +126,7 @@ def test_the_heart_bridges_a_gap_that_opens_in_one_phase():
 
 
 def test_a_heart_in_pieces_has_no_outer_surface():
-    heart, frame = balls(15.0)
+    heart, frame = balls(11.0)
     found = extract(heart, frame, np.array([0.0, 0.5]), SETTINGS)
     assert set(found.surfaces) == {"lv_endocardium", "epicardium", "rv_endocardium"}
     assert re.search(r"pieces in phase 1 .at 0\.500", found.left_out["heart"])
@@ -224,16 +224,47 @@ def test_a_structure_that_one_phase_lacks_is_left_out_and_the_phase_named():
 def test_a_structure_without_a_surface_is_left_out_but_the_left_ventricle_is_needed():
     """Of single voxels that touch nothing no body is left to follow."""
     heart = HEART.copy()
-    heart[0][heart[0] == LABELS["right_atrium"]] = 0
-    heart[0, 2:12:2, 2:12:2, 2:12:2] = LABELS["right_atrium"]
+    heart[0][heart[0] == LABELS["rv_cavity"]] = 0
+    heart[0, 2:12:2, 2:12:2, 2:12:2] = LABELS["rv_cavity"]
     found = extract(heart, FRAME, PHASES, SETTINGS)
-    assert "too small for a surface" in found.left_out["right_atrium"]
+    assert "too small for a surface" in found.left_out["rv_endocardium"]
     assert {"left_atrium", "epicardium"} <= set(found.surfaces)
 
     lost = HEART.copy()
     lost[2][np.isin(lost[2], [LABELS["lv_cavity"], LABELS["lv_myocardium"]])] = 0
     with pytest.raises(StageError, match=r"lv_endocardium: in phase 2 \(at 0\.350"):
         extract(lost, FRAME, PHASES, SETTINGS)
+
+
+@pytest.mark.parametrize(("least", "is_kept"), [(0.15, False), (0.5, True)])
+def test_an_atrium_that_one_phase_shows_a_sliver_of_is_left_out(least: float, is_kept: bool):
+    """What a stack shows that ends at the valves: at end-diastole they stand above its last slice.
+
+    The sliver is as thick as makes it hold a given share of the largest phase's voxels.
+    """
+    cut = HEART.copy()
+    atrium = cut == LABELS["left_atrium"]
+    counts = atrium.sum(axis=(1, 2, 3))
+    low = np.flatnonzero(atrium[0].any(axis=(1, 2)))
+    kept = np.cumsum(atrium[0].sum(axis=(1, 2)))
+    top = int(np.searchsorted(kept, least * counts.max()))
+    cut[0, top:][atrium[0, top:]] = 0
+    share = (cut[0] == LABELS["left_atrium"]).sum() / counts.max()
+    assert low[0] < top < low[-1]
+    assert (share >= 0.2) == is_kept
+    found = extract(cut, FRAME, PHASES, SETTINGS)
+    assert ("left_atrium" in found.surfaces) == is_kept
+    if not is_kept:
+        assert "ml in phase 0 (at 0.000 of the beat)" in found.left_out["left_atrium"]
+    assert {"right_atrium", "heart"} <= set(found.surfaces)
+
+
+def test_no_surface_encloses_other_than_its_labels():
+    """A ball that leaps by more than its radius from one phase to the next cannot be followed."""
+    heart, frame = balls(15.0)
+    found = extract(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+    assert "its labels 11.4 ml" in found.left_out["rv_endocardium"]
+    assert set(found.surfaces) == {"lv_endocardium", "epicardium", "heart"}
 
 
 def test_specks_of_a_structure_are_no_structure():

@@ -109,17 +109,19 @@ def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: floa
     Raises
     ------
     StageError
-        Naming every bound that is broken.
+        Naming every bound that is broken, and the structure where it is broken most.
     """
+    parts = accuracy["structures"]
     broken = [
-        f"{name} is {accuracy[name]:.4g}, allowed is {limit:.4g}"
+        f"{name} is {accuracy[name]:.4g} (most at {max(parts, key=lambda one: parts[one][name])}), "
+        f"allowed is {limit:.4g}"
         for name, limit in allowed_errors(bounds, spacing_mm).items()
         if not accuracy[name] <= limit
     ]
     if broken:
         raise StageError(
             f"bake: the field is not as exact as it must be: {'; '.join(broken)}; choose a finer "
-            "bake.spacing_mm, or allow more in bake.bounds"
+            "bake.spacing_mm, allow more in bake.bounds, or take that structure's fixtures out"
         )
 
 

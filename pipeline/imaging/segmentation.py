@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.errors import StageError
-from pipeline.geometry import Float, Float32, Integer, Label
+from pipeline.geometry import Float, Float32, Integer, Label, Mask
 from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
@@ -135,14 +135,29 @@ def segment_cine(
 
 
 def _require_contrast(cine: Cine) -> None:
+    """StageError where an image is of one grey value; what to do hangs on where its slice lies."""
     blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
-    if blank.any():
-        phase, number = np.argwhere(blank)[0]
-        raise StageError(
-            f"phase {phase}, slice {number}: no heart found: all its pixels are alike; export the "
-            f"images again, or do without this slice: cine.spoilt_slices: [{number}] in study.yaml "
-            "draws it between its neighbours"
+    if not blank.any():
+        return
+    phase, number = np.argwhere(blank)[0]
+    spoilt = blank.any(axis=0)
+    # From each end of the stack inwards, as far as slices are blank without a break.
+    at_an_end = np.logical_and.accumulate(spoilt) | np.logical_and.accumulate(spoilt[::-1])[::-1]
+    outer, inner = (_numbers(spoilt & where) for where in (at_an_end, ~at_an_end))
+    advice = [f"leave slice {outer}, at an end of the stack, out of the files"] * bool(outer)
+    if inner:
+        advice.append(
+            f"do without slice {inner}: cine.spoilt_slices: [{inner}] in study.yaml draws it "
+            "between its neighbours"
         )
+    raise StageError(
+        f"phase {phase}, slice {number}: no heart found: all its pixels are alike; export the "
+        f"images again, or {', and '.join(advice)}"
+    )
+
+
+def _numbers(which: Mask) -> str:
+    return ", ".join(map(str, np.flatnonzero(which)))
 
 
 def _drawn(found: PlaneProbability) -> Label:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -43,6 +43,13 @@ GROWN_ON = dict.fromkeys(("left_atrium", "right_atrium", "aorta"), ("epicardium"
 
 REQUIRED_STRUCTURES = ("lv_endocardium", "epicardium")
 
+# Least volume of a structure of ``GROWN_ON`` in a share of its largest. Atria keep a quarter or
+# more of theirs, great vessels nearly all; less tells that a stack which ends at the valves shows
+# slivers of them.
+LEAST_KEPT = 0.2
+# Most that a surface may enclose more or less than its labels, in a share of these; what offsetting
+# leaves is under a hundredth.
+VOLUME_TOLERANCE = 0.05
 # Tries at a mesh that passes through itself.
 UNCROSSINGS = 4
 # The interpreter lock leaves nothing for more.
@@ -104,8 +111,9 @@ def extract(
     -------
     Extraction
         A structure is left out where no phase or not every one shows it at a usable size (a stack
-        that ends at the valves reaches the atria only while the ventricles are short), or it
-        cannot be followed through the beat; the left ventricle never is.
+        that ends at the valves reaches the atria only while the ventricles are short), where it
+        cannot be followed through the beat, or where its surface does not enclose what its labels
+        do; the left ventricle never is.
 
     Raises
     ------
@@ -113,10 +121,10 @@ def extract(
         When shapes disagree, phases do not rise, or the grid is not isotropic.
     StageError
         When the left ventricle is missing in some phase, or its shape there has nothing to do with
-        its shape at the reference phase.
+        its shape at the reference phase, or its surface does not enclose what its labels do.
     """
     spacing_mm = _require_grid(heart, mr_from_index, phases)
-    absent = _absent(_label_counts(heart), phases)
+    absent = _absent(_label_counts(heart), phases, spacing_mm)
     parts = [name for name in STRUCTURES if name != "heart" and name not in absent]
     tell = progress or (lambda done, total: None)
 
@@ -128,21 +136,22 @@ def extract(
         except StageError as error:
             return error
 
-    def finish(name: str) -> _Followed:
+    def finish(name: str) -> _Followed | StageError:
         grown_on = [carried[other] for other in GROWN_ON.get(name, ()) if other in carried]
-        return _finished(_drawn(carried[name], grown_on, phases, settings), phases, settings, map)
+        drawn = _drawn(carried[name], grown_on, phases, settings)
+        try:
+            return _finished(drawn, phases, settings, map)
+        except StageError as error:
+            return error
 
-    followed: dict[str, _Followed] = {}
     with ThreadPoolExecutor(THREADS) as pool:
-        tried = dict(zip(parts, pool.map(carry, parts), strict=True))
-        carried = {name: one for name, one in tried.items() if isinstance(one, _Followed)}
-        lost = {name: one for name, one in tried.items() if isinstance(one, StageError)}
-        for name in REQUIRED_STRUCTURES:
-            if name in lost:
-                raise StageError(f"{name}: {lost[name]}") from lost[name]
-        for name, one in zip(carried, pool.map(finish, carried), strict=True):
-            followed[name] = one
-            tell(len(followed), len(carried) + 1)
+        carried, lost = _told_apart(parts, pool.map(carry, parts))
+        finished: list[_Followed | StageError] = []
+        for one in pool.map(finish, carried):
+            finished.append(one)
+            tell(len(finished), len(carried) + 1)
+        followed, also_lost = _told_apart(carried, finished)
+        lost |= also_lost
         outer = [one for name, one in followed.items() if name != "lv_endocardium"]
         try:
             followed["heart"] = _follow_heart(outer, phases, settings, pool.map)
@@ -158,6 +167,18 @@ def extract(
         {name: one.crossing_triangles for name, one in followed.items()},
         absent | {name: str(one) for name, one in lost.items()},
     )
+
+
+def _told_apart(
+    names: Iterable[str], tried: Iterable[_Followed | StageError]
+) -> tuple[dict[str, _Followed], dict[str, StageError]]:
+    """What was followed and what was lost; StageError for one that must be there."""
+    by_name = dict(zip(names, tried, strict=True))
+    lost = {name: one for name, one in by_name.items() if isinstance(one, StageError)}
+    for name in REQUIRED_STRUCTURES:
+        if name in lost:
+            raise StageError(f"{name}: {lost[name]}") from lost[name]
+    return {name: one for name, one in by_name.items() if isinstance(one, _Followed)}, lost
 
 
 def _require_grid(heart: Label, mr_from_index: Float, phases: Float) -> float:
@@ -185,8 +206,9 @@ def _label_counts(heart: Label) -> Integer:
     return np.stack([np.bincount(volume.ravel(), minlength=256) for volume in heart])
 
 
-def _absent(label_counts: Integer, phases: Float) -> dict[str, str]:
+def _absent(label_counts: Integer, phases: Float, spacing_mm: float) -> dict[str, str]:
     """Structures that are not there in all phases, and where; StageError for one that must be."""
+    voxel_ml = spacing_mm**3 / 1000
     absent = {}
     for name in STRUCTURES:
         counts = label_counts[:, [LABELS[label] for label in STRUCTURES[name]]].sum(axis=1)
@@ -203,6 +225,13 @@ def _absent(label_counts: Integer, phases: Float) -> dict[str, str]:
             absent[name] = "no phase shows it"
         elif short.any():
             absent[name] = f"not every phase shows it: {few}, {FEWEST_VOXELS} or more are needed"
+        elif name in GROWN_ON and counts[k] < LEAST_KEPT * counts.max():
+            largest = int(counts.argmax())
+            absent[name] = (
+                f"not every phase shows it whole: {voxel_ml * counts[k]:.1f} ml in phase {k} (at "
+                f"{phases[k]:.3f} of the beat), {voxel_ml * counts[largest]:.1f} ml in phase "
+                f"{largest}; slices that go on beyond the valves would show it"
+            )
     return absent
 
 
@@ -260,7 +289,7 @@ def _follow_heart(
 def _finished(
     one: _Followed, phases: Float, settings: SurfaceSettings, across: Across
 ) -> _Followed:
-    """Smooth in time, sound in every phase, and of the volume of the labels."""
+    """Smooth in time, sound in every phase, of the volume of the labels; StageError where not."""
     body, triangles = one.body, one.moving.triangles
     unfolder = make_unfolder(one.moving.at(nearest_phase(phases, settings.reference_phase)))
     unfolded = [unfolder.mended(vertices, bad_triangles) for vertices in one.moving.vertices_mm]
@@ -284,7 +313,22 @@ def _finished(
 
     places, mended, left = zip(*across(sound, range(len(path_mm))), strict=True)
     moving = MovingSurface(np.stack(places), triangles, phases)
+    _require_volumes(moving, body.volumes_mm3)
     return _Followed(body, moving, sum(mended), sum(left))
+
+
+def _require_volumes(moving: MovingSurface, volumes_mm3: Sequence[float]) -> None:
+    """StageError where a surface encloses something else than its labels do."""
+    enclosed = np.array([moving.at(k).volume_mm3() for k in range(len(volumes_mm3))])
+    off = np.abs(enclosed / np.array(volumes_mm3) - 1)
+    k = int(off.argmax())
+    # Written so that what is not a number fails too.
+    if not off[k] <= VOLUME_TOLERANCE:
+        raise StageError(
+            f"its surface encloses {enclosed[k] / 1000:.1f} ml in phase {k} (at "
+            f"{moving.phases[k]:.3f} of the beat), its labels {volumes_mm3[k] / 1000:.1f} ml: the "
+            "shape of the reference phase could not be carried there; look at the labels of both"
+        )
 
 
 def _placed(followed: _Followed, mr_from_index: Float) -> MovingSurface:
