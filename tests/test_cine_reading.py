@@ -91,7 +91,7 @@ def alter(name: str, value: Any, at: int = 2) -> Change:
             alter("ImageOrientationPatient", [1, 0, 0, 0, 0, -1]),
             "missing slice.*; not taken: .* not parallel",
         ),
-        (alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()), "different spacing"),
+        (alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()), "evenly spaced: "),
         (drop("TriggerTime"), "no trigger time"),
         (drop("NominalInterval"), "no RR interval"),
         (drop("ImagePositionPatient"), "no ImagePositionPatient"),

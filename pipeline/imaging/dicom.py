@@ -35,6 +35,14 @@ DIRECTORY, DIRECTORY_NAMES = "1.2.840.10008.1.3.10", ("DICOMDIR", "DICOMDIR;1")
 OTHER_IMAGES = (".nrrd", ".nhdr", ".mha", ".mhd", ".hdr", ".img", ".img.gz", ".mgz", ".mat", ".par")
 """Ends of names of images that other programs write."""
 
+NOTES = (
+    *(".txt", ".csv", ".tsv", ".xml", ".json", ".yaml", ".yml", ".md", ".html", ".htm", ".log"),
+    *(".pdf", ".rtf", ".doc", ".docx", ".xls", ".xlsx", ".png", ".jpg", ".jpeg", ".gif", ".bmp"),
+)
+"""Ends of names of what people keep beside images; no scanner's file is called so."""
+
+ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".rar", ".7z")
+
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
@@ -68,10 +76,10 @@ def read_dicom_study(
     paths = [path for path in files_below(folder) if path.name.upper() not in DIRECTORY_NAMES]
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
-    _require_dicom(paths)
+    images, notes = _told_from_notes(paths)
     frames: list[Frame] = []
-    others: list[LeftOut] = []
-    for path in paths:
+    others = [LeftOut(str(path), "notes", "", "not DICOM", "file") for path in notes]
+    for path in images:
         dataset = _read(path)
         if _is_directory(dataset):
             continue
@@ -92,21 +100,32 @@ def read_dicom_study(
     return stack, long_axis_views(frames, stack.cine)
 
 
-def _require_dicom(paths: Sequence[Path]) -> None:
-    """Refuse files that do not begin as DICOM does, all at once."""
-    others = [path for path in paths if not _begins_as_dicom(path)]
-    if others:
-        more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
-        image = next((one for one in others if one.name.lower().endswith(OTHER_IMAGES)), None)
-        if image:
-            raise InputError(
-                f"{image}: is an image, but neither DICOM nor NIfTI; save the cine as "
-                "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
-            )
+def _told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """DICOM files, and what is kept beside them; InputError, for all at once, where one is neither.
+
+    A file without an ending of its own that does not begin as DICOM does may be a damaged image.
+    """
+    images = [path for path in paths if _begins_as_dicom(path)]
+    known = set(images)
+    strange = [path for path in paths if path not in known]
+    notes = [path for path in strange if path.name.lower().endswith(NOTES)]
+    others = [path for path in strange if not path.name.lower().endswith(NOTES)]
+    if not others:
+        return images, notes
+    more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
+    image = next((one for one in others if one.name.lower().endswith(OTHER_IMAGES)), None)
+    if image:
         raise InputError(
-            f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
-            "it out of the folder where it does not belong there"
+            f"{image}: is an image, but neither DICOM nor NIfTI; save the cine as "
+            "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
         )
+    archive = next((one for one in others if one.name.lower().endswith(ARCHIVES)), None)
+    if archive:
+        raise InputError(f"{archive}: is an archive; unpack it, and take it out of the folder")
+    raise InputError(
+        f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
+        "it out of the folder where it does not belong there"
+    )
 
 
 def _names(paths: Sequence[Path]) -> str:

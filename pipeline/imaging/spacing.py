@@ -50,12 +50,17 @@ def regular_steps(
     counts = np.maximum(np.rint(lengths_mm / usual_mm), 1).astype(int)
     numbers = np.concatenate([[0], np.cumsum(counts)])
     step_mm = (positions_mm[-1] - positions_mm[0]) / numbers[-1]
-    off_mm = np.abs(positions_mm - positions_mm[0] - numbers[:, None] * step_mm).max()
-    if off_mm > max(0.1, 0.02 * usual_mm):
+    away_mm = positions_mm - positions_mm[0] - numbers[:, None] * step_mm
+    off_mm = np.linalg.norm(away_mm, axis=1)
+    allowed_mm = max(0.1, 0.02 * usual_mm)
+    if off_mm.max() > allowed_mm:
+        worst = int(off_mm.argmax())
+        along_mm = abs(float(away_mm[worst] @ slices[0][0].normal))
         raise InputError(
-            f"{where}: slices have different spacing: steps along the normal are "
-            f"{lengths_mm.round(2).tolist()} mm, or the slices are shifted sideways by "
-            f"{off_mm:.2f} mm; an evenly spaced stack is needed"
+            f"{where}: slices are not evenly spaced: {slices[worst][0].where} lies "
+            f"{off_mm[worst]:.2f} mm from its place in an even stack from the first to the last "
+            f"({along_mm:.2f} mm of it along the normal), {allowed_mm:.2f} mm are allowed; steps "
+            f"along the normal are {lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
         )
     too_wide = (counts > 2) | (lengths_mm > WIDEST_GAP_MM) if fill else True
     wide = np.flatnonzero((counts > 1) & too_wide)
