@@ -182,9 +182,11 @@ def _require_understood(
         worst = np.unravel_index(confidence.argmin(), confidence.shape)
         low = np.argwhere(confidence < settings.min_confidence)
         others = ", ".join(f"{k}/{view.order[z]}" for k, z in low[:MOST_NAMED])
+        # Rounded up it could read as the threshold that it is below.
+        least = np.floor(100 * confidence.min()) / 100
         raise StageError(
             f"phase {worst[0]}, slice {view.order[worst[1]]}: the labels are not certain enough: "
-            f"confidence {confidence.min():.2f}, at least {settings.min_confidence:.2f} is needed "
+            f"confidence {least:.2f}, at least {settings.min_confidence:.2f} is needed "
             f"({len(low)} images have less, phase/slice {others}"
             f"{' ...' if len(low) > MOST_NAMED else ''}); check them, do without a slice inside "
             "the stack (cine.spoilt_slices in study.yaml), or lower segment.min_confidence"
