@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.publish import read_record
-from pipeline.study import open_study, studies_in
+from pipeline.study import how_to_name_cine, open_study, studies_in
 from pipeline.study_files import cannot_be_entered, is_litter
 
 TABLE, LOGS = "batch.csv", "logs"
@@ -61,7 +61,11 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
     plans = [_plan(one, one in direct) for one in looked_at]
     plans = [one for one in plans if one.is_study or not here.is_relative_to(one.folder.resolve())]
     if not any(one.is_study for one in plans):
-        raise InputError(f"{studies}: holds no study (folders with cine/ or study.yaml)")
+        first = plans[0].folder if plans else studies
+        raise InputError(
+            f"{studies}: holds no study (folders with cine/ or study.yaml); for {first}: "
+            f"{how_to_name_cine(first)}"
+        )
     _require_out_elsewhere(studies, out, plans)
     return _without_clashes(plans)
 

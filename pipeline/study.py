@@ -175,7 +175,18 @@ def _no_study_message(folder: Path, inside: list[Path]) -> str:
             f"{folder}: holds {len(inside)} studies ({inside[0].name}, ...), one is needed; "
             "name one of them, or use `beatfield batch`"
         )
-    return f"{folder}: is no study: it has neither cine/ nor study.yaml"
+    return f"{folder}: is no study: it has neither cine/ nor study.yaml; {how_to_name_cine(folder)}"
+
+
+def how_to_name_cine(folder: Path) -> str:
+    """What makes a study of a folder that is none; of NIfTI files the largest is most often it."""
+    files = [one for one in folder.iterdir() if one.is_file()]
+    images = [one for one in files if one.name.lower().endswith(NIFTI_ENDINGS)]
+    name = max(images, key=lambda one: one.stat().st_size).name if images else "FOLDER"
+    return (
+        f"put its cine MR into cine/, or a line such as `cine: {{path: {name}}}` into "
+        f"{folder / 'study.yaml'} (docs/study.md)"
+    )
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -15,7 +15,9 @@ import pytest
 from batch_program import make_study, rows_of, stand_in
 
 from pipeline.batch_ending import how_it_ended
+from pipeline.batch_plan import plan_batch
 from pipeline.cli import main
+from pipeline.errors import InputError
 from pipeline.publish import locked
 
 # Writes what a finished run writes; study.yaml's patient_id is read as the pipeline does.
@@ -244,3 +246,15 @@ def test_a_library_that_takes_an_interrupt_for_an_error_was_interrupted(tmp_path
     assert how_it_ended(1, path, told_to_end=True)[0] == "interrupted"
     path.write_text("error: no heart\n")
     assert how_it_ended(1, path, told_to_end=True) == ("failed", "no heart")
+
+
+def test_of_a_set_that_holds_no_study_the_line_that_makes_one_is_told(tmp_path: Path) -> None:
+    """As public sets come: a folder a patient, the cine beside single phases and their labels."""
+    patient = tmp_path / "set" / "patient001"
+    patient.mkdir(parents=True)
+    for name, size in (("a_frame01.nii.gz", 20), ("a_4d.nii.gz", 90), ("a_frame01_gt.nii.gz", 9)):
+        (patient / name).write_bytes(b"x" * size)
+    (patient / "gone.nii").symlink_to(tmp_path / "nowhere")
+    for given in ("set", "set/patient001"):
+        with pytest.raises(InputError, match=r"cine: \{path: a_4d\.nii\.gz\}.*001/study\.yaml"):
+            plan_batch(tmp_path / given, tmp_path / "out")
