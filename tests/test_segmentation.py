@@ -207,6 +207,14 @@ def test_empty_images_are_refused_as_no_heart(study):
         segment_cine(replace(cine, intensity=np.zeros_like(cine.intensity)), QUICK)
 
 
+def test_labels_in_place_of_images_are_called_so(study):
+    cine = study[1]
+    labels = np.digitize(cine.intensity, np.quantile(cine.intensity, [0.9, 0.95, 0.98]))
+    labels[:, 0] = 0
+    with pytest.raises(StageError, match="phase 0 has 4 grey values in all, as labels do"):
+        segment_cine(replace(cine, intensity=labels.astype(np.float32)), QUICK)
+
+
 def test_every_empty_slice_is_named_and_only_inner_ones_are_to_be_redrawn(study):
     cine = study[1]
     last = cine.intensity.shape[1] - 1

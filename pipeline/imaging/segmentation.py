@@ -30,6 +30,9 @@ from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import Orientation, View
 from pipeline.progress import Progress
 
+FEWEST_GREYS = 16
+"""Grey values of one phase; fewer are labels."""
+
 LARGEST_BARE = 0.5
 """Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""
 
@@ -135,7 +138,16 @@ def segment_cine(
 
 
 def _require_contrast(cine: Cine) -> None:
-    """StageError where an image is of one grey value; what to do hangs on where its slice lies."""
+    """StageError where an image is of one grey value, or all are of a few, as labels are.
+
+    What to do about an empty image hangs on where its slice lies.
+    """
+    greys = len(np.unique(cine.intensity[0]))
+    if 1 < greys < FEWEST_GREYS:
+        raise StageError(
+            f"no heart found: phase 0 has {greys} grey values in all, as labels do; give the "
+            "images that these were drawn on as the cine"
+        )
     blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
     if not blank.any():
         return
