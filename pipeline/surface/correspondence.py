@@ -165,8 +165,9 @@ def carry_through_cycle(
     for k, phase in enumerate(order[1:], start=1):
         late = (phases[phase] - phases[reference]) % 1.0
         blended = (1 - late) * forward[k] + late * backward[-k]
-        settled = carrier.settle(levels[phase], blended)
-        path[phase] = untangled(settled, template.triangles, levels[phase])
+        # Where the two slid apart, the mean of two places on a bent surface lies off it.
+        found = carrier.elastic(levels[phase], blended, carrier.smoothers)
+        path[phase] = untangled(found, template.triangles, levels[phase])
         _require_arrival(path[phase], levels[phase], phase, phases[phase])
     return path
 
