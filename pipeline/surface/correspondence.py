@@ -30,6 +30,8 @@ REACH_EDGES = (8.0, 3.0, 1.0)
 SMOOTHER_ERROR = 0.01
 ELASTIC_STEPS = 2
 FINISHING_STEPS = 2
+# Vertices that may end off the surface: a thin tip that a phase does not show has nowhere to go.
+STRAY_SHARE = 0.05
 # Vertices of the surfaces within that tell an outer one where to go, and how near they should be.
 COMPANIONS = 12
 COMPANION_MM = 4.0
@@ -153,7 +155,7 @@ def carry_through_cycle(
     Raises
     ------
     StageError
-        When half the vertices end more than a voxel from the surface of some phase.
+        When a twentieth of the vertices end more than a voxel from the surface of some phase.
     """
     count = len(levels)
     carrier = make_carrier(template)
@@ -198,7 +200,7 @@ def carry_along(
     Raises
     ------
     StageError
-        When half the vertices end more than a voxel from the surface of some phase.
+        When a twentieth of the vertices end more than a voxel from the surface of some phase.
     """
     carrier = make_carrier(template)
     way_at, _ = _companions(template.vertices_mm, within_mm, reference)
@@ -277,12 +279,13 @@ def _chain(carrier: Carrier, start_mm: Float, levels: Sequence[LevelSet]) -> lis
 
 
 def _require_arrival(vertices_mm: Float, level: LevelSet, number: int, phase: float) -> None:
-    """StageError unless the vertices came to lie on the zero level, in the median."""
-    off_mm = float(np.median(np.abs(level.sample(vertices_mm)[0])))
+    """StageError unless the vertices came to lie on the zero level, but for a few."""
+    off_mm = float(np.quantile(np.abs(level.sample(vertices_mm)[0]), 1 - STRAY_SHARE))
     if off_mm > level.spacing_mm:
         raise StageError(
-            f"the surface could not follow to phase {number} (at {phase:.3f} of the beat): it ends "
-            f"{off_mm:.1f} mm from it, one voxel is allowed; look at the labels of that phase"
+            f"the surface could not follow to phase {number} (at {phase:.3f} of the beat): "
+            f"{STRAY_SHARE:.0%} of its vertices end {off_mm:.1f} mm or more from it, one voxel is "
+            "allowed; look at the labels of that phase"
         )
 
 
