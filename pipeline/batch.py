@@ -33,7 +33,7 @@ from pipeline.publish import (
     locked,
     read_record,
     readable_write_errors,
-    record_bytes,
+    record_stamp,
     remove,
 )
 
@@ -71,9 +71,16 @@ class Batch:
 
 
 def run_batch(
-    studies: Path, out: Path, workers: int, config: Path | None, watcher: BatchWatcher
+    studies: Path,
+    out: Path,
+    workers: int,
+    config: Path | None,
+    watcher: BatchWatcher,
+    last: str | None = None,
 ) -> Batch:
     """Run every study below ``studies``; write ``out/batch.csv`` after each.
+
+    Runs end after the stage ``last``, where one is given.
 
     A signal that ends programs begins no other study and is passed to those that run, which are
     waited for; SIGINT once more ends them at once.
@@ -90,7 +97,7 @@ def run_batch(
             remove(orphan)
         with readable_write_errors(out / LOGS):
             (out / LOGS).mkdir(exist_ok=True)
-        batch = _Running(out, config, watcher, plans)
+        batch = _Running(out, config, last, watcher, plans)
         batch.run(workers)
         return batch.end(studies)
 
@@ -158,10 +165,17 @@ def _passing_signals_on(children: _Children, watcher: BatchWatcher) -> Iterator[
 
 class _Running:
     def __init__(
-        self, out: Path, config: Path | None, watcher: BatchWatcher, plans: Sequence[Plan]
+        self,
+        out: Path,
+        config: Path | None,
+        last: str | None,
+        watcher: BatchWatcher,
+        plans: Sequence[Plan],
     ) -> None:
-        self._out, self._config, self._watcher = out, config, watcher
-        self._plans = plans
+        self._out, self._watcher, self._plans = out, watcher, plans
+        self._options = ["--out", str(out)]
+        self._options += ["--config", str(config)] if config else []
+        self._options += ["--until", last] if last else []
         self._children = _Children()
         self._ended: list[Ended] = []
 
@@ -216,10 +230,9 @@ class _Running:
         if self._children.stopped:
             return self._not_done(plan, INTERRUPTED, "not begun")
         command = [sys.executable, "-m", "pipeline.batch_member", "run", str(plan.folder)]
-        command += ["--out", str(self._out)]
-        command += ["--config", str(self._config)] if self._config else []
+        command += self._options
         log = self._out / LOGS / _log_name(plan.name)
-        before = record_bytes(products_of(self._out, plan))
+        before = record_stamp(products_of(self._out, plan))
         clock = time.perf_counter()
         with readable_write_errors(log):
             handle = log.open("w")
@@ -241,17 +254,23 @@ class _Running:
         return outcome_of(*ended, seconds, record, products)
 
     def _not_done(
-        self, plan: Plan, status: str, cause: str, seconds: float = 0.0, before: bytes | None = None
+        self,
+        plan: Plan,
+        status: str,
+        cause: str,
+        seconds: float = 0.0,
+        before: tuple[int, int] | None = None,
     ) -> Ended:
         """A study that is not done, and what an earlier run of it left standing."""
         products = products_of(self._out, plan)
+        record = read_record(products)
+        came_to_a_stage = before not in (None, record_stamp(products))
         if NOT_TO_BE_USED not in cause:
-            known = record_bytes(products) if before is None else before
-            cause = "; ".join(filter(None, (cause, old_products(products, known))))
-        same_study = read_record(products).get("study") == str(plan.folder.resolve())
-        shown = products if same_study else None
+            cause = "; ".join(filter(None, (cause, old_products(products, came_to_a_stage))))
+        shown = products if record.get("study") == str(plan.folder.resolve()) else None
+        of_this_run = record if shown and came_to_a_stage else None
         ended = plan.name, status, cause, plan.patient_id, plan.folder
-        return outcome_of(*ended, seconds, products=shown)
+        return outcome_of(*ended, seconds, of_this_run, shown)
 
 
 def _log_name(patient: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.batch_table import INTERRUPTED
 from pipeline.errors import INTERRUPTED_CODE, NOT_TO_BE_USED
-from pipeline.publish import STAGE_FILE, read_record, record_bytes
+from pipeline.publish import STAGE_FILE, read_record
 
 TOLD_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OUT_OF_MEMORY = (signal.SIGKILL, signal.SIGABRT)
@@ -57,15 +57,11 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def old_products(products: Path | None, record_before: bytes) -> str:
-    """A sentence on products that a study which is not done leaves standing; empty without any.
-
-    ``record_before`` is ``run.json`` before the study was run: where it is the same now, the run
-    came to no stage.
-    """
+def old_products(products: Path | None, came_to_a_stage: bool) -> str:
+    """A sentence on products that a study which is not done leaves standing; empty without any."""
     if products is None or not any(products.glob(f"*/{STAGE_FILE}")):
         return ""
-    if record_bytes(products) == record_before:
+    if not came_to_a_stage:
         return f"{products} holds products of another run; {NOT_TO_BE_USED}"
     stages = read_record(products).get("stages", {})
     stale = ", ".join(name for name, one in stages.items() if one.get("status") == "stale")

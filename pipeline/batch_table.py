@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,12 @@ class Outcome:
 
     seconds: float
     lv_ejection_fraction: float | None
+    rv_ejection_fraction: float | None
+    lv_end_diastolic_volume_ml: float | None
+    lv_end_systolic_volume_ml: float | None
+    rv_end_diastolic_volume_ml: float | None
+    rv_end_systolic_volume_ml: float | None
+    lv_mass_g: float | None
     target_registration_error_mm: float | None
     largest_distance_error_mm: float | None
     expected_tre_mm: float | None
@@ -70,33 +76,67 @@ def outcome_of(
     record: Mapping[str, Any] | None = None,
     products: Path | None = None,
 ) -> Ended:
-    """Describe how a study ended; ``record`` is what its ``run.json`` says where it is done."""
-    stages = (record or {}).get("stages", {})
-    end = round(seconds, 1), *_figures(stages), cause, patient_id, str(study)
-    return Ended(Outcome(patient, status, *end, str(products or "")), _images(record or {}))
+    """Describe how a study ended; ``record`` is what its ``run.json`` says of this run.
+
+    Of one that is not done the table has what its finished stages measured; what they remarked is
+    among the causes already.
+    """
+    stages = {
+        name: stage
+        for name, stage in (record or {}).get("stages", {}).items()
+        if stage.get("status") != "stale"
+    }
+    outcome = Outcome(
+        patient=patient,
+        status=status,
+        seconds=round(seconds, 1),
+        **_figures(stages),
+        registration=_verdict(stages.get("register", {})),
+        remarks=_remarks(stages) if status == "done" else "",
+        cause=cause,
+        patient_id=patient_id,
+        study=str(study),
+        products=str(products or ""),
+    )
+    return Ended(outcome, _images(record or {}))
 
 
-def _figures(
-    stages: dict[str, Any],
-) -> tuple[float | None, float | None, float | None, float | None, str, str]:
+def _figures(stages: Mapping[str, Any]) -> dict[str, float | None]:
+    """What of an outcome is measured."""
+
     def figure(stage: str, *keys: str) -> float | None:
         value = stages.get(stage, {}).get("figures", {})
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         return value if isinstance(value, float) else None
 
-    told, unregistered = remarks(stages), _unregistered(stages.get("register", {}))
-    if unregistered:
-        told = [("not registered", unregistered), *told]
-    verdict = stages.get("register", {}).get("figures", {}).get("verdict", "")
-    return (
-        figure("surface", "lv_ejection_fraction"),
-        figure("evaluate", "target_registration_error_mm"),
-        figure("bake", "accuracy", "distance_error_max_mm"),
-        figure("register", "expected_tre_mm"),
-        "failed" if unregistered else verdict,
-        "; ".join(f"{word}: {text}" for word, text in told),
-    )
+    def volume(chamber: str, pick: Callable[[list[float]], float]) -> float | None:
+        volumes_ml = stages.get("surface", {}).get("figures", {}).get("volumes_ml", {})
+        return pick(volumes_ml[chamber]) if chamber in volumes_ml else None
+
+    return {
+        "lv_ejection_fraction": figure("surface", "lv_ejection_fraction"),
+        "rv_ejection_fraction": figure("surface", "rv_ejection_fraction"),
+        "lv_end_diastolic_volume_ml": volume("lv_endocardium", max),
+        "lv_end_systolic_volume_ml": volume("lv_endocardium", min),
+        "rv_end_diastolic_volume_ml": volume("rv_endocardium", max),
+        "rv_end_systolic_volume_ml": volume("rv_endocardium", min),
+        "lv_mass_g": figure("surface", "lv_mass_g"),
+        "target_registration_error_mm": figure("evaluate", "target_registration_error_mm"),
+        "largest_distance_error_mm": figure("bake", "accuracy", "distance_error_max_mm"),
+        "expected_tre_mm": figure("register", "expected_tre_mm"),
+    }
+
+
+def _remarks(stages: dict[str, Any]) -> str:
+    unregistered = _unregistered(stages.get("register", {}))
+    told = [("not registered", unregistered)] if unregistered else []
+    return "; ".join(f"{word}: {text}" for word, text in [*told, *remarks(stages)])
+
+
+def _verdict(register: Mapping[str, Any]) -> str:
+    verdict: str = register.get("figures", {}).get("verdict", "")
+    return "failed" if _unregistered(register) else verdict
 
 
 def _unregistered(register: Mapping[str, Any]) -> str:

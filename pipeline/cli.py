@@ -157,7 +157,15 @@ def bake(
 
 
 @app.command
-def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None) -> int:
+def batch(
+    studies: Path,
+    /,
+    *,
+    out: Out,
+    workers: int = 1,
+    config: Config = None,
+    until: str | None = None,
+) -> int:
     """Run a folder of studies, each in a process of its own; print and write a table of all.
 
     An interrupt begins no other study; the table then has what ended. Logs are in OUT/logs.
@@ -168,6 +176,9 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
         Folder whose subfolders are studies.
     workers
         How many studies to run at a time.
+    until
+        End each study's run after this stage: ingest, segment, surface, register, bake, evaluate or
+        report.
     """
     from pipeline.batch import run_batch
     from pipeline.batch_table import NO_STUDY, table
@@ -178,7 +189,7 @@ def batch(studies: Path, /, *, out: Out, workers: int = 1, config: Config = None
     # What is wrong with the settings is wrong for every study, and is said once.
     read_settings(config)
 
-    ended = run_batch(studies, out, workers, config, BatchConsole())
+    ended = run_batch(studies, out, workers, config, BatchConsole(), _stage_name(until))
     show(table(ended.outcomes))
     for note in ended.notes:
         show(f"note      {note}")

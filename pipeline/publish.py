@@ -213,18 +213,19 @@ def write_whole(path: Path, text: str) -> None:
 def read_record(products: Path | None) -> dict[str, Any]:
     """What ``run.json`` says; nothing where there is none that can be read."""
     try:
-        content = json.loads(record_bytes(products))
-    except ValueError:
+        content = json.loads((products / "run.json").read_bytes()) if products else {}
+    except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
-def record_bytes(products: Path | None) -> bytes:
-    """``run.json`` as it is; empty where there is none."""
+def record_stamp(products: Path | None) -> tuple[int, int]:
+    """What changes whenever ``run.json`` is written, if only to the same; (0, 0) without one."""
     try:
-        return (products / "run.json").read_bytes() if products else b""
+        found = (products / "run.json").stat() if products else None
     except OSError:
-        return b""
+        found = None
+    return (found.st_ino, found.st_mtime_ns) if found else (0, 0)
 
 
 def seal(folder: Path, fingerprint: str, figures: Mapping[str, Any]) -> None:
