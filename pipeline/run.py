@@ -321,6 +321,7 @@ def _described(study: Study, stage: Stage) -> dict[str, Any]:
     says: dict[str, Any] = {}
     if "cine" in stage.inputs:
         says["rr_ms"] = study.cine.rr_ms
+        says["leave_out_series"] = study.cine.leave_out_series
         says["fill_gaps"] = study.cine.fill_gaps
         says["spoilt_slices"] = study.cine.spoilt_slices
     if "us" in stage.inputs and study.us:

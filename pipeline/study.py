@@ -48,6 +48,9 @@ class CineFiles(_Section):
     rr_ms: float | None = Field(None, gt=0)
     """Overrides the files' own RR interval."""
 
+    leave_out_series: tuple[int, ...] = ()
+    """Numbers of DICOM series that are not to be used."""
+
     fill_gaps: bool = False
     """Let the mean of both neighbours stand in for a slice that is missing from DICOM files."""
 
@@ -382,6 +385,11 @@ def _require_what_fits_the_cine(study: Study) -> None:
         raise InputError(
             f"{described}: cine.path: {cine.path} is no NIfTI file (.nii, .nii.gz); of DICOM "
             "files, even of a single one, name the folder"
+        )
+    if cine.path.is_file() and cine.leave_out_series:
+        raise InputError(
+            f"{described}: cine.leave_out_series: applies to DICOM only, and {cine.path} is NIfTI, "
+            "which has no series; take the key out"
         )
     if cine.path.is_file() and cine.fill_gaps:
         raise InputError(

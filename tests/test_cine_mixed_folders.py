@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ from pydicom.uid import (
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.imaging.cine import stack_frames
+from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.frames import Frame
 from pipeline.job import Job
 from pipeline.stages import ingest
@@ -277,6 +279,22 @@ def repeated_slice() -> list[FileDataset]:
     return found
 
 
+def test_a_series_that_study_yaml_leaves_out_is_not_read(tmp_path: Path) -> None:
+    """Where a slice was taken again, whoever made the study says which is good."""
+    folder = mixed(tmp_path, repeated_slice())
+    stack, _ = read_dicom_study(folder, without_series=(9,))
+    assert_is_the_stack(stack)
+    images = f"{PHASES} images (the first is 0000_other.dcm)"
+    reason = "study.yaml leaves it out"
+    assert stack.left_out == (f'series 9 "slice 3 again": {images}: {reason}',)
+    again, _ = read_dicom_study(folder, without_series=(3,))
+    assert again.cine.intensity.shape == stack.cine.intensity.shape
+    assert (again.cine.intensity[:, 2] == 2 * stack.cine.intensity[:, 2]).all()
+    assert (again.cine.intensity[:, 1] == stack.cine.intensity[:, 1]).all()
+    with pytest.raises(InputError, match=r"holds no series 4711.*leave_out_series.*1, 2, 3, 4, 9"):
+        read_dicom_study(folder, without_series=(9, 4711))
+
+
 def turned_slice() -> list[FileDataset]:
     found = [in_series(dicom_frame(SLICES, phase), 9, "turned") for phase in range(PHASES)]
     for data in found:
@@ -352,6 +370,9 @@ def test_what_is_left_out_is_told_by_the_stage(tmp_path: Path) -> None:
     figures = ingest.run(job)
     assert len(figures["left_out"]) == 3
     assert all('series 9 "localiser": 1 image (00' in line for line in figures["left_out"])
+    (tmp_path / "study.yaml").write_text("cine: {leave_out_series: [9]}\n")
+    (line,) = ingest.run(replace(job, study=open_study(tmp_path)))["left_out"]
+    assert line.startswith('series 9 "localiser": 3 images')
 
 
 def slice_frame(series: int, z: int, phase: int, title: str, **changed: Any) -> Frame:

@@ -304,6 +304,9 @@ def test_gaps_of_a_nifti_cine_are_not_silently_left_open(tmp_path: Path) -> None
         InputError, match=r"cine\.fill_gaps: applies to DICOM only.*x\.nii is NIfTI"
     ):
         open_study(tmp_path / "p")
+    (tmp_path / "p" / "study.yaml").write_text("cine: {leave_out_series: [3]}\n")
+    with pytest.raises(InputError, match=r"cine\.leave_out_series: .*NIfTI, which has no series"):
+        open_study(tmp_path / "p")
     (tmp_path / "p" / "study.yaml").write_text("cine: {fill_gaps: false}\n")
     assert open_study(tmp_path / "p").cine.path == cine / "x.nii"
 
@@ -341,7 +344,7 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("patient_id: A 7", "patient_id: needs letters, digits and '_ . -' alone"),
         (
             "cine: mr",
-            r"cine: needs keys below it \(path, timing, rr_ms, fill_gaps, spoilt_slices\)",
+            r"cine: needs keys below it \(path, timing, rr_ms, leave_out_series, fill_gaps, spoilt",
         ),
         (
             "cine: {}\necg: {}\ncine: {rr_ms: 9}",

@@ -12,6 +12,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32
 from pipeline.imaging.frames import (
     LEAST_OF_A_BEAT,
+    LEAVE_OUT,
     MIN_PHASES,
     MIN_SLICES,
     Frame,
@@ -298,7 +299,7 @@ def _require_given_once(slices: Sequence[Sequence[Frame]], name: str, where: str
                 raise InputError(
                     f"{where}: slice {number} is given twice: by {first[0].series}, "
                     f"{_images(first)}, and by {second[0].series}, {_images(second)}, which "
-                    "show the same trigger time or overlap; keep one series a slice"
+                    f"show the same trigger time or overlap; keep one series a slice: {LEAVE_OUT}"
                 )
 
 

@@ -14,9 +14,9 @@ from pydicom.misc import is_dicom
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
+from pipeline.imaging.dicom_pixels import rescaled, stored_pixels, upright
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
-from pipeline.imaging.limits import MOST_PIXELS, require_bounded
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
 from pipeline.study_files import files_below
 
@@ -52,7 +52,10 @@ PHASE_IMAGES = {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"}
 
 
 def read_dicom_study(
-    folder: Path, rr_ms: float | None = None, fill: bool = False
+    folder: Path,
+    rr_ms: float | None = None,
+    fill: bool = False,
+    without_series: Sequence[int] = (),
 ) -> tuple[Stack, tuple[LongAxis, ...]]:
     """Read every DICOM file below ``folder``, classic or Enhanced: one cine stack, and the
     long-axis views that lie beside it (`pipeline.imaging.long_axis_series.long_axis_views`).
@@ -66,38 +69,57 @@ def read_dicom_study(
         Overrides the files' own RR interval.
     fill
         Let the mean of both neighbours stand in for a slice that is missing.
+    without_series
+        SeriesNumbers of what is not to be used.
 
     Raises
     ------
     InputError
-        When a file is not readable or truncated, an MR image has no place in space, the stack's
-        images have no trigger time, or they do not make up a regular stack.
+        When a file is not readable or truncated, a series that is to be left out is
+        not there, an MR image has no place in space, the stack's images have no trigger time, or
+        they do not make up a regular stack.
     """
     paths = [path for path in files_below(folder) if path.name.upper() not in DIRECTORY_NAMES]
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
     images, notes = _told_from_notes(paths)
     frames: list[Frame] = []
+    numbers: set[int | None] = set()
     others = [LeftOut(str(path), "notes", "", "not DICOM", "file") for path in notes]
     for path in images:
         dataset = _read(path)
         if _is_directory(dataset):
             continue
         try:
-            other = _other_object(dataset)
+            number = _series_number(dataset)
+            unwanted = number in without_series
+            other = "study.yaml leaves it out" if unwanted else _other_object(dataset)
         except (ValueError, TypeError) as error:
             raise _not_understood(str(path), error) from error
+        numbers.add(number)
         if other:
             uid = str(dataset.get("SeriesInstanceUID", ""))
-            others.append(LeftOut(str(path), _series_name(dataset), uid, other, "object"))
+            noun = "image" if unwanted else "object"
+            others.append(LeftOut(str(path), _series_name(dataset), uid, other, noun))
         else:
             frames += _read_frames(dataset, path, rr_ms)
+    _require_series(without_series, numbers, str(folder))
     if not frames:
         found = "; ".join(left_out_lines(others, str(folder)))
         raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
     source = None if rr_ms is None else "study.yaml"
     stack = stack_frames(frames, str(folder), source, others, fill)
     return stack, long_axis_views(frames, stack.cine)
+
+
+def _require_series(asked: Sequence[int], there: set[int | None], where: str) -> None:
+    absent = [number for number in asked if number not in there]
+    if absent:
+        known = sorted(number for number in there if number is not None)
+        raise InputError(
+            f"{where}: holds no series {absent[0]}, which cine.leave_out_series in study.yaml "
+            f"names; there are {', '.join(map(str, known)) or 'none with a number'}"
+        )
 
 
 def _told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -176,7 +198,7 @@ def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
             f"{path}: holds no image (truncated, or not an image object); "
             "copy it again, or take it out of the cine folder"
         )
-    pixels = _upright(_pixels(dataset, path), dataset)
+    pixels = upright(stored_pixels(dataset, path), dataset)
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         if len(pixels) > 1:
             raise InputError(
@@ -215,64 +237,6 @@ def _groups(shared: Any, own: Any) -> Groups:
     return with_converted
 
 
-def _pixels(dataset: Any, path: Path) -> Any:
-    """Stored values, ``(frame, row, column)``."""
-    frames = max(int(dataset.get("NumberOfFrames", 1) or 1), 1)
-    pixels = int(dataset.Rows or 0) * int(dataset.get("Columns") or 0)
-    require_bounded(pixels, f"{path}: one image", MOST_PIXELS)
-    require_bounded(frames * pixels, str(path))
-    try:
-        stored = dataset.pixel_array
-    except Exception as error:  # pydicom's decoders raise many kinds for damaged pixel data
-        stored = _read_by_gdcm(dataset, path)
-        if stored is None:
-            raise InputError(
-                f"{path}: its pixels cannot be read, the file is truncated, damaged or compressed "
-                f"in a way not known here ({_syntax(dataset).name}; {error}); copy it again from "
-                "the scanner, uncompressed"
-            ) from error
-    if stored.size != frames * dataset.Rows * dataset.Columns:
-        raise InputError(f"{path}: is in colour; the cine needs grey images")
-    return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
-
-
-def _syntax(dataset: Any) -> Any:
-    return dataset.file_meta.get("TransferSyntaxUID", pydicom.uid.ImplicitVRLittleEndian)
-
-
-def _read_by_gdcm(dataset: Any, path: Path) -> Any:
-    """Stored values of one compressed classic image, by a library that knows more ways, or None.
-
-    That library gives rescaled values: the stored ones are found again from them. What it makes
-    of white for black differs with the encoding, so that is not asked of it.
-    """
-    plain = dataset.get("PhotometricInterpretation") == "MONOCHROME2"
-    enhanced = "PerFrameFunctionalGroupsSequence" in dataset
-    syntax = _syntax(dataset)
-    if enhanced or not plain or not syntax.is_transfer_syntax or not syntax.is_compressed:
-        return None
-    import SimpleITK as sitk
-
-    reader = sitk.ImageFileReader()
-    reader.SetImageIO("GDCMImageIO")
-    reader.SetFileName(str(path))
-    try:
-        values = sitk.GetArrayFromImage(reader.Execute())
-    except RuntimeError:
-        return None
-    slope, intercept = _rescaling(dataset)
-    return np.rint((values - intercept) / slope) if (slope, intercept) != (1, 0) else values
-
-
-def _upright(stored: Any, dataset: Any) -> Any:
-    """Stored values as they grow with brightness."""
-    if dataset.get("PhotometricInterpretation") != "MONOCHROME1":
-        return stored
-    most = 2 ** int(dataset.BitsStored) - 1
-    # Complement of two: the largest is one less than the smallest's magnitude.
-    return (-1 if int(dataset.get("PixelRepresentation", 0)) else most) - stored.astype(np.int32)
-
-
 def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None) -> Frame:
     place = group("PlanePositionSequence").get("ImagePositionPatient")
     axes = group("PlaneOrientationSequence").get("ImageOrientationPatient")
@@ -288,7 +252,7 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
         position_mm, directions, spacing_mm = _geometry(place, axes, spacing)
         return Frame(
             where=where,
-            pixels=_rescaled(pixels, group("PixelValueTransformationSequence")),
+            pixels=rescaled(pixels, group("PixelValueTransformationSequence")),
             position_mm=position_mm,
             axes=directions,
             spacing_mm=spacing_mm,
@@ -329,20 +293,6 @@ def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[
     return position_mm, directions, (along_row, along_column)
 
 
-def _rescaled(pixels: Any, transformation: Any) -> Any:
-    """Stored values times slope plus intercept."""
-    slope, intercept = _rescaling(transformation)
-    if (slope, intercept) == (1, 0):
-        return pixels
-    return pixels.astype(np.float32) * np.float32(slope) + np.float32(intercept)
-
-
-def _rescaling(transformation: Any) -> tuple[float, float]:
-    """Slope, 1 where none or 0 is told, and intercept."""
-    slope = float(transformation.get("RescaleSlope", 1) or 1)
-    return slope, float(transformation.get("RescaleIntercept", 0) or 0)
-
-
 def _times_ms(timing: Any, rr_ms: float | None) -> dict[str, float]:
     """What tells the frame's moment, the most trusted first.
 
@@ -379,9 +329,14 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
     return None
 
 
+def _series_number(dataset: Any) -> int | None:
+    number = dataset.get("SeriesNumber")
+    return None if number in (None, "") else int(number)
+
+
 def _series_name(dataset: Any) -> str:
-    number, title = dataset.get("SeriesNumber"), dataset.get("SeriesDescription")
-    name = "images of an unnumbered series" if number in (None, "") else f"series {number}"
+    number, title = _series_number(dataset), dataset.get("SeriesDescription")
+    name = "images of an unnumbered series" if number is None else f"series {number}"
     return f'{name} "{title}"' if title else name
 
 

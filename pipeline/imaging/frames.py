@@ -31,6 +31,8 @@ LEAST_OF_A_BEAT = 0.1
 USUAL_RR_MS = 900.0
 """Of a person at rest, where nothing tells."""
 
+LEAVE_OUT = "take the other's files out, or name its number in cine.leave_out_series in study.yaml"
+
 Rank = tuple[bool, int, bool, int, float]
 """Whether a set is a cine stack, the images of the largest one in its direction, whether original,
 its own number of images, pixels per mm2."""
@@ -234,8 +236,8 @@ def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame], folder: str) 
     return tuple(
         f"{one[0].series} ({inside(one[0].where, folder)}, ...) is a cine of "
         f"{len(slice_positions(one))} slices too, in another direction than {stack[0].series}, "
-        f"which was taken for its {len(stack)} images: if that is not the short axis, leave it out "
-        "of the folder"
+        f"which was taken for its {len(stack)} images: if that is not the short axis, take its "
+        "files out, or name its number in cine.leave_out_series in study.yaml"
         for one in others
         if not _parallel(stack[0], one[0])
     )
@@ -266,7 +268,7 @@ def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str)
             raise InputError(
                 f"{where}: holds two stacks of {rank[3]} images in different directions, "
                 f"{first.series} ({first.where}) and {other.series} ({other.where}); "
-                "keep the one to be used"
+                f"keep the one to be used: {LEAVE_OUT}"
             )
 
 

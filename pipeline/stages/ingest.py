@@ -38,7 +38,8 @@ def run(job: Job) -> dict[str, Any]:
     """
     files = job.study.cine
     if files.path.is_dir():
-        stack, views = read_dicom_study(files.path, files.rr_ms, files.fill_gaps)
+        without = files.leave_out_series
+        stack, views = read_dicom_study(files.path, files.rr_ms, files.fill_gaps, without)
     else:
         stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
         views = read_nifti_views(job.study.long_axis, files.rr_ms)

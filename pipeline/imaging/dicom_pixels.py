@@ -1,0 +1,84 @@
+"""Pixels of a DICOM object, in whatever way they are stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+
+from pipeline.errors import InputError
+from pipeline.imaging.limits import MOST_PIXELS, require_bounded
+
+
+def stored_pixels(dataset: Any, path: Path) -> Any:
+    """Stored values, ``(frame, row, column)``."""
+    frames = max(int(dataset.get("NumberOfFrames", 1) or 1), 1)
+    pixels = int(dataset.Rows or 0) * int(dataset.get("Columns") or 0)
+    require_bounded(pixels, f"{path}: one image", MOST_PIXELS)
+    require_bounded(frames * pixels, str(path))
+    try:
+        stored = dataset.pixel_array
+    except Exception as error:  # pydicom's decoders raise many kinds for damaged pixel data
+        stored = _read_by_gdcm(dataset, path)
+        if stored is None:
+            raise InputError(
+                f"{path}: its pixels cannot be read, the file is truncated, damaged or compressed "
+                f"in a way not known here ({_syntax(dataset).name}; {error}); copy it again from "
+                "the scanner, uncompressed"
+            ) from error
+    if stored.size != frames * dataset.Rows * dataset.Columns:
+        raise InputError(f"{path}: is in colour; the cine needs grey images")
+    return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
+
+
+def _syntax(dataset: Any) -> Any:
+    return dataset.file_meta.get("TransferSyntaxUID", pydicom.uid.ImplicitVRLittleEndian)
+
+
+def _read_by_gdcm(dataset: Any, path: Path) -> Any:
+    """Stored values of one compressed classic image, by a library that knows more ways, or None.
+
+    That library gives rescaled values: the stored ones are found again from them. What it makes
+    of white for black differs with the encoding, so that is not asked of it.
+    """
+    plain = dataset.get("PhotometricInterpretation") == "MONOCHROME2"
+    enhanced = "PerFrameFunctionalGroupsSequence" in dataset
+    syntax = _syntax(dataset)
+    if enhanced or not plain or not syntax.is_transfer_syntax or not syntax.is_compressed:
+        return None
+    import SimpleITK as sitk
+
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("GDCMImageIO")
+    reader.SetFileName(str(path))
+    try:
+        values = sitk.GetArrayFromImage(reader.Execute())
+    except RuntimeError:
+        return None
+    slope, intercept = _rescaling(dataset)
+    return np.rint((values - intercept) / slope) if (slope, intercept) != (1, 0) else values
+
+
+def upright(stored: Any, dataset: Any) -> Any:
+    """Stored values as they grow with brightness."""
+    if dataset.get("PhotometricInterpretation") != "MONOCHROME1":
+        return stored
+    most = 2 ** int(dataset.BitsStored) - 1
+    # Complement of two: the largest is one less than the smallest's magnitude.
+    return (-1 if int(dataset.get("PixelRepresentation", 0)) else most) - stored.astype(np.int32)
+
+
+def rescaled(pixels: Any, transformation: Any) -> Any:
+    """Stored values times slope plus intercept."""
+    slope, intercept = _rescaling(transformation)
+    if (slope, intercept) == (1, 0):
+        return pixels
+    return pixels.astype(np.float32) * np.float32(slope) + np.float32(intercept)
+
+
+def _rescaling(transformation: Any) -> tuple[float, float]:
+    """Slope, 1 where none or 0 is told, and intercept."""
+    slope = float(transformation.get("RescaleSlope", 1) or 1)
+    return slope, float(transformation.get("RescaleIntercept", 0) or 0)
