@@ -257,6 +257,18 @@ def placed(path: Path, sform: int, qform: int, apart_mm: float = 0.0) -> tuple[s
     return read_nifti_cine(path / "placed.nii.gz", None).remarks
 
 
+def test_voxels_that_lost_their_size_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "cine.nii"
+    nifti_cine(path, np.eye(4))
+    (remark,) = read_nifti_cine(path, None).remarks
+    assert "voxels of 1 x 1 x 1 mm, so of a heart in 4 mm" in remark
+    # Whole hearts in cubes of 1 mm, and flat voxels, are what they are.
+    for affine, slices in ((np.eye(4), 70), (np.diag([1, 1, 8, 1]), 4)):
+        image = nibabel.Nifti1Image(np.zeros((40, 40, slices, 5), np.int16), affine)
+        nibabel.save(image, path)
+        assert read_nifti_cine(path, None, 800).remarks == ()
+
+
 def test_a_header_that_places_the_images_nowhere_is_told(tmp_path: Path) -> None:
     (remark,) = placed(tmp_path, 0, 0)
     assert "places the images nowhere" in remark

@@ -32,6 +32,9 @@ VOXEL_MM = (0.1, 50.0)
 SAME_PLACE_MM = 0.5
 """By which two placements of one stack may differ: less than a pixel."""
 
+LEAST_HEIGHT_MM = 60
+"""No stack of fewer millimetres holds a heart from tip to valves."""
+
 OBLONG = 4
 """With more slices than this times the columns or rows, the axes are in another order."""
 
@@ -130,7 +133,8 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         phases,
         float(own_rr_ms.mean()) / 1000,
     )
-    return Stack(cine, triggers, own_rr_ms, source, (), _doubts_of_place(image))
+    doubts = *_doubts_of_size(edges_mm, slice_count), *_doubts_of_place(image)
+    return Stack(cine, triggers, own_rr_ms, source, (), doubts)
 
 
 def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis, ...]:
@@ -221,6 +225,18 @@ def _right_angled_affine(image: Any, path: Path) -> Float:
             "with axes at right angles"
         )
     return affine
+
+
+def _doubts_of_size(edges_mm: Float, slices: int) -> tuple[str, ...]:
+    """What speaks against the size of the voxels, in words: cubes of 1 mm are what arrays become
+    that are saved without a header."""
+    if slices >= LEAST_HEIGHT_MM or not np.allclose(edges_mm, 1, atol=1e-6):
+        return ()
+    return (
+        f"the NIfTI header tells of voxels of 1 x 1 x 1 mm, so of a heart in {slices} mm, as "
+        "programs do that save an array alone; pixels of a cine are 1 to 2 mm wide, and its slices "
+        "5 to 10 mm apart: if so here, write the affine of the images that these were made of",
+    )
 
 
 def _doubts_of_place(image: Any) -> tuple[str, ...]:
