@@ -327,23 +327,24 @@ def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
     stack = read_dicom_cine(tmp_path)
     assert_is_the_stack(stack)
     assert stack.left_out == ()
-    for name in ("study.yaml", "Case.CSV", "viewer.exe", "EMPTY"):
-        (tmp_path / name).write_bytes(b"x" * (name != "EMPTY"))
+    beside = {"Case.CSV": b"x", "viewer.exe": b"MZ", "AUTORUN.INF": b"x", "README": b"As you\n"}
+    for name, content in {**beside, "study.yaml": b"x", "EMPTY": b"", "IM7": b"\0\1x"}.items():
+        (tmp_path / name).write_bytes(content)
     (tmp_path / "ANNOTATED.seq.NRRD").touch()
     with pytest.raises(
         InputError, match=r"NRRD: is an image, but neither DICOM nor NIfTI.*4D \.nii\.gz"
     ):
         read_dicom_cine(tmp_path)
     (tmp_path / "ANNOTATED.seq.NRRD").unlink()
-    with pytest.raises(InputError, match=r"EMPTY and 1 more \(viewer.exe\): is not"):
+    with pytest.raises(InputError, match=r"EMPTY and 1 more \(IM7\): is not"):
         read_dicom_cine(tmp_path)
-    (tmp_path / "viewer.exe").unlink()
+    (tmp_path / "IM7").unlink()
     (tmp_path / "EMPTY").rename(tmp_path / "cine.zip")
     with pytest.raises(InputError, match=r"cine\.zip: is an archive; unpack it"):
         read_dicom_cine(tmp_path)
     (tmp_path / "cine.zip").unlink()
     told = read_dicom_cine(tmp_path).left_out
-    assert told == ("notes: 2 files (the first is Case.CSV): not DICOM",)
+    assert told == ("notes: 5 files (the first is AUTORUN.INF): not DICOM",)
 
 
 def test_times_that_a_converter_left_among_the_unassigned_are_read(tmp_path: Path) -> None:

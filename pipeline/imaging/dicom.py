@@ -41,6 +41,15 @@ NOTES = (
 )
 """Ends of names of what people keep beside images; no scanner's file is called so."""
 
+VIEWERS = (
+    *(".exe", ".dll", ".msi", ".bat", ".cmd", ".inf", ".ini", ".cfg", ".jar", ".class", ".ico"),
+    *(".lnk", ".chm", ".css", ".js", ".svg", ".ttf", ".sys", ".so", ".dylib", ".properties"),
+)
+"""Ends of names of the programs that archives put on a disc with the images."""
+
+TEXT_BYTES = 4096
+"""Of a file without an ending, these many tell whether it is text, as a disc's README."""
+
 ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".rar", ".7z")
 
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
@@ -130,8 +139,8 @@ def _told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     images = [path for path in paths if _begins_as_dicom(path)]
     known = set(images)
     strange = [path for path in paths if path not in known]
-    notes = [path for path in strange if path.name.lower().endswith(NOTES)]
-    others = [path for path in strange if not path.name.lower().endswith(NOTES)]
+    notes = [path for path in strange if _is_note(path)]
+    others = [path for path in strange if not _is_note(path)]
     if not others:
         return images, notes
     more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
@@ -148,6 +157,15 @@ def _told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
         f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
         "it out of the folder where it does not belong there"
     )
+
+
+def _is_note(path: Path) -> bool:
+    if path.suffix:
+        return path.name.lower().endswith((*NOTES, *VIEWERS))
+    with path.open("rb") as handle:
+        begins = handle.read(TEXT_BYTES)
+    # An image that lost its beginning holds bytes that no text does.
+    return bool(begins) and begins.isascii() and not set(begins) & set(range(9))
 
 
 def _names(paths: Sequence[Path]) -> str:
