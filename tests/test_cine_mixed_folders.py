@@ -323,8 +323,11 @@ def second_stack() -> list[FileDataset]:
             repeated_slice,
             r'slice 2 is given twice: by series 3 .*, and by series 9 "slice 3 again"',
         ),
-        (turned_slice, "turned in their plane"),
-        (further_slices_finer, "different matrices"),
+        (turned_slice, "turned in their plane: .*cine.leave_out_series"),
+        (
+            further_slices_finer,
+            r'matrices: series \d "cine short axis" .*, series 9 "the last slice" .*leave_out',
+        ),
         (second_stack, "two stacks of 20 images in different directions"),
     ],
 )

@@ -346,28 +346,29 @@ def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> st
 
 def _refuse(first: Frame, other: Frame, where: str) -> None:
     """Say what keeps two parallel sets apart that show different slices."""
+    one, two = (f"{frame.series} ({frame.where})" for frame in (first, other))
     if other.pixels.shape != first.pixels.shape:
-        raise InputError(
-            f"{where}: slices have different matrices: {first.where} has "
-            f"{first.pixels.shape}, {other.where} has {other.pixels.shape} (rows, columns); "
-            "give one stack of one matrix"
+        what = (
+            f"slices have different matrices: {one} has {first.pixels.shape}, {two} has "
+            f"{other.pixels.shape} (rows, columns); give one stack of one matrix"
         )
-    if not np.allclose(other.spacing_mm, first.spacing_mm, rtol=1e-3):
-        raise InputError(
-            f"{where}: slices have different pixel spacing: {first.where} has "
-            f"{first.spacing_mm} mm, {other.where} has {other.spacing_mm} mm; "
-            "give one stack of one spacing"
+    elif not np.allclose(other.spacing_mm, first.spacing_mm, rtol=1e-3):
+        what = (
+            f"slices have different pixel spacing: {one} has {first.spacing_mm} mm, {two} has "
+            f"{other.spacing_mm} mm; give one stack of one spacing"
         )
-    if not _same_axes(first, other):
-        raise InputError(
-            f"{where}: slices are turned in their plane: rows and columns of {other.where} run "
-            f"along {other.axes.round(3).tolist()}, those of {first.where} along "
+    elif not _same_axes(first, other):
+        what = (
+            f"slices are turned in their plane: rows and columns of {two} run along "
+            f"{other.axes.round(3).tolist()}, those of {one} along "
             f"{first.axes.round(3).tolist()}; give one stack of one direction"
         )
-    raise InputError(
-        f"{where}: {first.where} is {first.kind}, {other.where} is {other.kind} and shows a slice "
-        "that the others lack; give one stack of one kind"
-    )
+    else:
+        what = (
+            f"{one} is {first.kind}, {two} is {other.kind} and shows a slice that the others lack; "
+            "give one stack of one kind"
+        )
+    raise InputError(f"{where}: {what}: {LEAVE_OUT}")
 
 
 def _spared(frames: Iterable[Frame], reason: str) -> list[LeftOut]:

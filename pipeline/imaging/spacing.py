@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
-from pipeline.imaging.frames import Frame
+from pipeline.imaging.frames import LEAVE_OUT, Frame
 
 NEARLY_ONE, NEARLY_ONE_MM = 0.4, 4.0
 """A step of less than this share of the median one, and than this, is none: with slices missing the
@@ -91,7 +91,7 @@ def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, whe
             f"{where}: slices {short[0]} and {short[0] + 1} lie {lengths_mm[short[0]]:.2f} mm "
             f"apart, others {np.median(lengths_mm):.2f} mm: nearly the same slice is given "
             f"twice, by {first.series} ({first.where}) and by {second.series} ({second.where}); "
-            "keep one"
+            f"keep one: {LEAVE_OUT}"
         )
 
 
