@@ -11,9 +11,12 @@ import pytest
 import SimpleITK as sitk
 from cine_files import (
     ALL_FRAMES,
+    COLUMNS,
     NORMAL,
     ORIGIN_MM,
     PHASES,
+    PIXEL_MM,
+    ROWS,
     RR_MS,
     SLICES,
     STEP_MM,
@@ -345,6 +348,25 @@ def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
     (tmp_path / "cine.zip").unlink()
     told = read_dicom_cine(tmp_path).left_out
     assert told == ("notes: 5 files (the first is AUTORUN.INF): not DICOM",)
+
+
+def test_directions_of_few_decimals_are_read(tmp_path: Path) -> None:
+    """Three: what was of length 1 is 0.9998 long, whose square is the cosine of 1.2 degrees."""
+    axes = np.array([[0.776, 0.622, 0.105], [-0.297, 0.507, -0.809]])
+    normal = np.cross(*axes)
+
+    def turn(data: FileDataset, number: int, phase: int) -> bool:
+        data.ImageOrientationPatient = axes.ravel().tolist()
+        data.ImagePositionPatient = (number * STEP_MM * normal).round(1).tolist()
+        return True
+
+    write_dicom(tmp_path, turn)
+    cine = read_dicom_cine(tmp_path).cine
+    assert cine.intensity.shape == (PHASES, SLICES, ROWS, COLUMNS)
+    np.testing.assert_allclose(cine.spacing_mm[:2], PIXEL_MM[::-1], atol=1e-9)
+    found = cine.mr_from_index[:3, :2] / cine.spacing_mm[:2]
+    np.testing.assert_allclose(found.T, axes, atol=5e-4)
+    assert abs(found[:, 0] @ found[:, 1]) < 1e-9
 
 
 def test_times_that_a_converter_left_among_the_unassigned_are_read(tmp_path: Path) -> None:

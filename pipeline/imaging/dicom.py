@@ -308,7 +308,9 @@ def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[
         raise ValueError(f"ImageOrientationPatient {directions.ravel().tolist()}")
     if not (np.isfinite(position_mm).all() and 0 < min(along_row, along_column) < np.inf):
         raise ValueError(f"position {position_mm.tolist()} and PixelSpacing {list(spacing)}")
-    return position_mm, directions, (along_row, along_column)
+    # Of directions written with few decimals, the nearest that are of length 1 and at right angles.
+    left, _, right = np.linalg.svd(directions, full_matrices=False)
+    return position_mm, left @ right, (along_row, along_column)
 
 
 def _times_ms(timing: Any, rr_ms: float | None) -> dict[str, float]:
