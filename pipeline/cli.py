@@ -336,7 +336,10 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
     """
     from pipeline.imaging.ecg import read_ecg
     from pipeline.registration.rhythm import doubt, read_rhythm, write_rhythm
+    from pipeline.study_files import is_of_record
 
+    if is_of_record(out, record):
+        raise InputError(f"--out {out}: is the recording itself; choose another name for the table")
     ecg = read_ecg(record, gaps=True)
     try:
         beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)

@@ -102,6 +102,14 @@ def record_files(stem: Path | None) -> list[Path]:
     return sorted(found)
 
 
+def is_of_record(path: Path, record: Path) -> bool:
+    """Whether a file that is there is one that an ECG record, as a user names it, is read from."""
+    stem = record.with_suffix("") if record.suffix in WFDB_ENDINGS else record
+    header = stem.parent / f"{stem.name}.hea"
+    read = [record, header, *(header.parent / name for name in names_in_header(header))]
+    return path.exists() and any(one.exists() and path.samefile(one) for one in read)
+
+
 def names_in_header(header: Path) -> list[str]:
     """What a WFDB header names: the files of its signals, or the records of its segments.
 

@@ -53,6 +53,23 @@ def test_a_steady_heart_is_followed_exactly():
     assert np.abs(cyclic(ticks[late, 1] - truth)).max() < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("fast_s", "slow_s", "beats"), [(0.3, 0.8, 20), (0.3, 1.0, 20), (0.5, 1.6, 20), (0.4, 1.3, 0)]
+)
+def test_a_heart_that_slows_down_by_three_is_followed_again(fast_s, slow_s, beats):
+    """Within six beats, as where a racing rhythm breaks off, or noise was taken for one."""
+    racing = 0.2 + fast_s * np.arange(beats)
+    after_s = racing[-1] if beats else 0.2
+    slow = after_s + slow_s * np.arange(1, 30)
+    ticks, _ = follow(np.concatenate([racing, slow]), slow[-1], cycle_rr_s=fast_s)
+    late = ticks[:, 0] > after_s + 6 * slow_s + KNOWN_S
+    assert ticks[late, 3].mean() > 0.95
+    truth = (ticks[late, 0] - after_s) / slow_s
+    told = to_cycle(truth % 1, slow_s, fast_s)
+    wrong = np.abs(cyclic(ticks[late, 1] - told))[ticks[late, 3] == 1]
+    assert wrong.max() < 0.05
+
+
 def test_breathing_is_predicted_better_than_by_the_last_interval():
     beat = np.arange(80)
     rr_s = 0.8 + 0.05 * np.sin(2 * np.pi * beat / 5.3)

@@ -42,6 +42,19 @@ def test_a_wfdb_record_gives_its_beats(ecg, tmp_path, ending, capsys):
     assert "beats" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["rec.hea", "rec.dat", "../wfdb/rec.dat"])
+def test_a_table_does_not_replace_its_recording(ecg, tmp_path, name, capsys):
+    folder = tmp_path / "wfdb"
+    folder.mkdir()
+    write_wfdb(folder, "rec", ecg)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert main(["rpeaks", str(folder / "rec"), "--out", str(folder / name)]) == 2
+    assert "is the recording itself" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    for _ in range(2):
+        assert main(["rpeaks", str(folder / "rec"), "--out", str(folder / "rec_peaks.csv")]) == 0
+
+
 def test_csv_times_are_those_of_the_recording(ecg, tmp_path):
     times_s = 100.0 + np.arange(len(ecg.signal_mv)) / 250.0
     lines = ["time_s,I,II,V1"]

@@ -345,8 +345,10 @@ def _watch(c: Float, now_s: float, usable: bool) -> None:
     waited_s = now_s - c[LAST_R]
     if not usable or c[BEATS] < 1.0 or waited_s > 3.0 * c[RR]:
         c[STATE], c[NEEDED], c[GOOD], c[VALID] = LOST, 3.0, 0.0, 0.0
-        # How many beats were missed is unknown: the next one ends no interval.
-        c[GAP] = 1.0
+        if not usable or waited_s > max(3.0 * c[RR], LONGEST_RR_S):
+            # How many beats were missed is unknown: the next one ends no interval. A shorter wait
+            # may be a heart that beats three times slower, as after a racing rhythm.
+            c[GAP] = 1.0
     elif waited_s > c[RR] + tolerance(c) + c[LATENCY]:
         # After an early beat comes a pause, and in fibrillation nothing is due.
         c[STATE] = LOST if c[STATE] == REGULAR else c[STATE]

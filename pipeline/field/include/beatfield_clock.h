@@ -403,7 +403,8 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
         c->known.needed = 3;
         c->known.good = 0;
         c->valid = 0;
-        c->known.gap = 1;
+        if (!usable || waited_s > bfc_max(3.0 * c->known.rr_s, BFC_LONGEST_RR_S))
+            c->known.gap = 1;
     } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + latency_s) {
         c->known.rhythm = c->known.rhythm == BF_REGULAR ? BF_LOST : c->known.rhythm;
         c->known.good = 0;
