@@ -350,6 +350,16 @@ def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
     assert told == ("notes: 5 files (the first is AUTORUN.INF): not DICOM",)
 
 
+@pytest.mark.filterwarnings("ignore:Invalid value for VR IS")
+def test_a_series_that_is_not_numbered_is_read(tmp_path: Path) -> None:
+    def label(data: FileDataset, number: int, phase: int) -> bool:
+        data.add_new("SeriesNumber", "LO", "S1")
+        return True
+
+    write_dicom(tmp_path, label)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
 def test_directions_of_few_decimals_are_read(tmp_path: Path) -> None:
     """Three: what was of length 1 is 0.9998 long, whose square is the cosine of 1.2 degrees."""
     axes = np.array([[0.776, 0.622, 0.105], [-0.297, 0.507, -0.809]])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from cine_files import PHASES, RR_MS, dicom_frame, in_series, write_dicom
+from cine_files import COLUMNS, PHASES, ROWS, RR_MS, dicom_frame, in_series, write_dicom
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -116,6 +116,38 @@ def test_views_beside_one_another_are_two(tmp_path: Path, changes: dict[str, Any
     add_view(tmp_path, 1, **(place | changes))
     _, views = read_dicom_study(tmp_path)
     assert [len(view.cine.intensity) for view in views] == [PHASES, PHASES]
+
+
+def test_a_view_taken_again_is_another_and_its_copy_is_none(tmp_path: Path) -> None:
+    """Put into one, images of two breath-holds would take turns."""
+    write_dicom(tmp_path)
+    add_view(tmp_path, 0)
+    sevens = np.full((ROWS, COLUMNS), 7, "<u2").tobytes()
+    add_view(tmp_path, 1, NominalInterval=900, PixelData=sevens)
+    for phase in range(PHASES):
+        # As an Enhanced copy of the first tells its times, rounded otherwise.
+        data = in_series(dicom_frame(0, phase), 52, "a copy")
+        data.ImageOrientationPatient, data.NominalInterval = ACROSS, 1000
+        data.TriggerTime = f"{float(data.TriggerTime) + 1e-5:.5f}"
+        data.save_as(tmp_path / f"view_2_{phase}.dcm")
+    late = in_series(dicom_frame(0, 1), 53, "late enhancement")
+    late.ImageOrientationPatient, late.TriggerTime = ACROSS, 555
+    late.save_as(tmp_path / "late.dcm")
+    _, views = read_dicom_study(tmp_path)
+    assert [view.name for view in views] == ['series 50 "view 0"', 'series 51 "view 1"']
+    assert [len(view.cine.phases) for view in views] == [PHASES, PHASES]
+    assert [view.cine.rr_s for view in views] == [1.0, 0.9]
+    assert (views[1].cine.intensity == 7).all()
+
+
+def test_a_view_of_a_series_for_each_phase_is_one(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    for phase in range(PHASES):
+        data = in_series(dicom_frame(0, phase), 50 + phase, "view")
+        data.ImageOrientationPatient = ACROSS
+        data.save_as(tmp_path / f"view_{phase}.dcm")
+    _, (view,) = read_dicom_study(tmp_path)
+    assert len(view.cine.phases) == PHASES
 
 
 def test_views_written_then_read_are_the_same(tmp_path: Path) -> None:

@@ -339,5 +339,6 @@ def _require_complete(slices: Sequence[Sequence[Frame]], where: str) -> None:
     if short:
         raise InputError(
             f"{where}: missing phase: slice {short[0]} ({slices[short[0]][0].where}) has "
-            f"{counts[short[0]]} phases, the others have {usual}; complete or remove the slice"
+            f"{counts[short[0]]} phases, the others have {usual}; complete or remove the slice, or "
+            "leave out what is mixed in: cine.leave_out_series in study.yaml takes its number"
         )

@@ -350,8 +350,12 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
 
 
 def _series_number(dataset: Any) -> int | None:
-    number = dataset.get("SeriesNumber")
-    return None if number in (None, "") else int(number)
+    """None where the file does not tell, or tells no number: it is a label, no more."""
+    try:
+        number = dataset.get("SeriesNumber")
+        return None if number in (None, "") else int(number)
+    except (ValueError, TypeError):
+        return None
 
 
 def _series_name(dataset: Any) -> str:

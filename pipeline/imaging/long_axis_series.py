@@ -40,7 +40,8 @@ def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...
     Original images of one slice at `MIN_PHASES` moments or more, with trigger times within their
     RR interval, at least `LEAST_ANGLE_DEG` from the stack's slices, and in the same frame of
     reference: a patient laid down anew is somewhere else. Localisers and images of one moment are
-    none. Parallel slices are views each, for each has a breath-hold of its own.
+    none. Parallel slices are views each, and so is a slice that was taken again, for each has a
+    breath-hold of its own.
     """
     frames = list(frames)
     normal = np.cross(stack.mr_from_index[:3, 0], stack.mr_from_index[:3, 1])
@@ -55,8 +56,7 @@ def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...
                 slices.append([frame])
             else:
                 of_its_slice.append(frame)
-    found = (_view(one) for one in slices)
-    return tuple(view for view in found if view is not None)
+    return tuple(view for one in slices for view in _views(one))
 
 
 def _cosine(frame: Frame, normal: Float) -> float:
@@ -76,6 +76,25 @@ def _same_slice(first: Frame, frame: Frame) -> bool:
         and np.allclose(frame.axes, first.axes, rtol=0, atol=1e-3)
         and np.allclose(frame.position_mm, first.position_mm, rtol=0, atol=NEAREST_SLICES_MM)
     )
+
+
+def _views(frames: Sequence[Frame]) -> list[LongAxis]:
+    """What the images of one slice make up: a view a series, or one where none is a cine alone.
+
+    Of two series of the same images, as of a classic and an Enhanced object, one is taken.
+    """
+    by_series: dict[str, list[Frame]] = {}
+    for frame in frames:
+        by_series.setdefault(frame.series_uid, []).append(frame)
+    views: list[LongAxis] = []
+    for one in by_series.values():
+        view = _view(one)
+        if view and not any(
+            np.array_equal(view.cine.intensity, other.cine.intensity) for other in views
+        ):
+            views.append(view)
+    together = None if views else _view(frames)
+    return [together] if together else views
 
 
 def _view(frames: Sequence[Frame]) -> LongAxis | None:
