@@ -140,10 +140,11 @@ def test_a_view_taken_again_is_another_and_its_copy_is_none(tmp_path: Path) -> N
     assert (views[1].cine.intensity == 7).all()
 
 
-def test_a_view_of_a_series_for_each_phase_is_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("at_a_time", [1, 2, 3])
+def test_a_view_of_a_series_for_some_phases_each_is_one(tmp_path: Path, at_a_time: int) -> None:
     write_dicom(tmp_path)
     for phase in range(PHASES):
-        data = in_series(dicom_frame(0, phase), 50 + phase, "view")
+        data = in_series(dicom_frame(0, phase), 50 + phase // at_a_time, "view")
         data.ImageOrientationPatient = ACROSS
         data.save_as(tmp_path / f"view_{phase}.dcm")
     _, (view,) = read_dicom_study(tmp_path)

@@ -79,7 +79,7 @@ def _same_slice(first: Frame, frame: Frame) -> bool:
 
 
 def _views(frames: Sequence[Frame]) -> list[LongAxis]:
-    """What the images of one slice make up: a view a series, or one where none is a cine alone.
+    """What the images of one slice make up: a view a series, or one where these are its parts.
 
     Of two series of the same images, as of a classic and an Enhanced object, one is taken.
     """
@@ -93,8 +93,11 @@ def _views(frames: Sequence[Frame]) -> list[LongAxis]:
             np.array_equal(view.cine.intensity, other.cine.intensity) for other in views
         ):
             views.append(view)
-    together = None if views else _view(frames)
-    return [together] if together else views
+    spans = sorted((view.cine.phases[0], view.cine.phases[-1]) for view in views)
+    if all(later[0] > earlier[1] for earlier, later in pairwise(spans)) and len(views) != 1:
+        together = _view(frames)
+        return [together] if together else views
+    return views
 
 
 def _view(frames: Sequence[Frame]) -> LongAxis | None:
