@@ -120,11 +120,11 @@ def _plain(rng, duration_s, times_s, waves=NORMAL, rr_s=0.8, scatter=0.03, **kw)
     return beats, draw(rng, times_s, beats, **kw)
 
 
-def _alternating(rng, duration_s, times_s, one, other, early_share):
+def _alternating(rng, duration_s, times_s, one, other, early_share, pair_s=1.7):
     beats, at_s = [], 0.4
     while at_s < duration_s:
-        beats += [(at_s, one), (at_s + early_share * 1.7, other)]
-        at_s += 1.7 * (1 + 0.02 * rng.normal())
+        beats += [(at_s, one), (at_s + early_share * pair_s, other)]
+        at_s += pair_s * (1 + 0.02 * rng.normal())
     return beats, draw(rng, times_s, beats)
 
 
@@ -238,6 +238,10 @@ CASES = {
     "bigeminy": partial(_alternating, one=NORMAL, other=WIDE, early_share=0.33),
     "bigeminy, large": partial(
         _alternating, one=scaled(NORMAL, 0.6), other=scaled(WIDE, 1.6), early_share=0.35
+    ),
+    # No pause is so long that a beat seems overdue.
+    "bigeminy, small": partial(
+        _alternating, one=NORMAL, other=scaled(WIDE, 0.45), early_share=0.4, pair_s=1.2
     ),
     "alternans": partial(_alternating, one=NORMAL, other=scaled(NORMAL, 0.5), early_share=0.5),
     "runs": _runs,

@@ -93,6 +93,8 @@ class Lead:
     weight: float
     """Its say in what the leads tell together; 0 while it shows nothing."""
     here: Here
+    wide: Annotated[Float, SHAPE_POINTS]
+    """Shape of the last tall and wide wave of low energy."""
     usual: Usual
     before: Usual
     """What was usual before the latest beat, should that be none."""
@@ -109,6 +111,10 @@ class Rhythm:
     last_steep: float
     strange: int
     """Beats of another shape in succession."""
+    outdone: bool
+    """Whether a sharper wave followed the last beat too soon for a beat of its own."""
+    outdone_before: int
+    """For how many beats in succession, up to the one before that, this was so."""
     intervals: int
     """RR intervals so far, of which the latest are kept."""
     interval: Annotated[Float, KEPT_INTERVALS]

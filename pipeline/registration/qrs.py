@@ -7,9 +7,9 @@ add up, and seconds for samples, so that rates differ in nothing but the number 
 
 With every sample, in this order:
 
-1. ``_store``: it goes into a ring, and ``quality`` judges whether its lead is still connected.
-2. ``_filter``: energy in the band of the QRS complex is the mean envelope of one complex wavelet (a
-   Gaussian's second derivative and its Hilbert transform). It does not depend on polarity and
+1. ``store``: it goes into a ring, and ``quality`` judges whether its lead is still connected.
+2. ``envelope``: energy in the band of the QRS complex is the mean envelope of one complex wavelet
+   (a Gaussian's second derivative and its Hilbert transform). It does not depend on polarity and
    weighs a T wave as high as R with a sixth.
 3. ``_learn``: until beats are plain to see, levels of beats and of what lies between them are
    sought in all samples so far (``levels``); then all of these are gone through anew.
@@ -17,7 +17,7 @@ With every sample, in this order:
    what lies between (inverse variance), so a lead that is lost or noisy has no say.
 5. ``_decide``: the highest sum that nothing exceeded for ``confirm`` samples is a wave. ``_judge``
    takes it for a beat if it is none of noise, T waves and P waves (``rules``). It may also show
-   that the beat before was its P wave: that one is unlearnt.
+   that the beat before was its P wave, or in a fast heart a T wave: that one is unlearnt.
 6. ``_look_back``: when a beat is overdue, the highest wave since the last one is judged again, by
    lower thresholds; after a long silence levels are learnt again.
 7. ``_accept``: a beat, timed by its shape (``waves``), is told; levels, intervals and shapes
@@ -26,11 +26,10 @@ With every sample, in this order:
 
 from __future__ import annotations
 
-import math
-
 from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
 from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
+from pipeline.registration.envelope import store
 from pipeline.registration.levels import (
     LEAST_NOISE,
     REFRACTORY_S,
@@ -38,13 +37,16 @@ from pipeline.registration.levels import (
     learn_level,
     wave_levels,
 )
-from pipeline.registration.quality import BRIDGED_S, RUN_S, SETTLE_S, shows_nothing, watch
+from pipeline.registration.quality import RUN_S, shows_nothing
 from pipeline.registration.rules import (
     LATE_T_WAVE_S,
     LONG_AHEAD_S,
+    OUTDONE,
+    SPLIT_S,
     T_WAVE_S,
     VERY_ALIKE,
     is_beat,
+    is_sharper_than_last,
     last_may_be_p_wave,
     learn_stature,
     measure_stature,
@@ -95,7 +97,7 @@ def feed(block: Float, plan: Plan, s: State) -> int:
     now = s.now[0]
     now.found = 0
     for row in range(len(block)):
-        _store(block[row], plan, s)
+        store(block[row], plan, s)
         at = now.seen
         now.seen = at + 1
         middle = at - plan.half - plan.mean
@@ -106,48 +108,6 @@ def feed(block: Float, plan: Plan, s: State) -> int:
         elif at - now.learn_at >= plan.learn:
             _learn(middle, plan, s)
     return now.found
-
-
-@compiled
-def _store(sample: Float, plan: Plan, s: State) -> None:
-    """Put one sample of every lead into the rings, and filter."""
-    now, length = s.now[0].seen, plan.length
-    at = now % length
-    for k in range(len(sample)):
-        lead, value = s.leads[k], sample[k]
-        lead.missing = 0 if math.isfinite(value) else lead.missing + 1
-        if lead.missing > 0:
-            value = lead.last
-        if lead.missing > max(1.0, BRIDGED_S * plan.rate_hz):
-            lead.bad_until = now + SETTLE_S * plan.rate_hz
-        if now == 0:
-            s.raw[k, :] = value
-        else:
-            watch(lead, s.raw[k], value, now, plan)
-        lead.last = value
-        s.raw[k, at] = value
-        s.raw[k, at + length] = value
-        _filter(k, now, plan, s)
-
-
-@compiled
-def _filter(k: int, now: int, plan: Plan, s: State) -> None:
-    """Power of the wavelet half its width ago, and its mean half a mean before that."""
-    half, length = plan.half, plan.length
-    start = (now - 2 * half) % length
-    even, odd = 0.0, 0.0
-    for j in range(2 * half + 1):
-        value = s.raw[k, start + j]
-        even += s.even[j] * value
-        odd += s.odd[j] * value
-    at = (now - half) % length
-    s.power[k, at] = even * even + odd * odd
-    s.power[k, at + length] = s.power[k, at]
-    start = (now - half - 2 * plan.mean) % length
-    total = 0.0
-    for j in range(2 * plan.mean + 1):
-        total += s.power[k, start + j]
-    s.energy[k, (now - half - plan.mean) % length] = math.sqrt(total / (2 * plan.mean + 1))
 
 
 @compiled
@@ -216,24 +176,30 @@ def _fuse(i: int, plan: Plan, s: State) -> float:
 @compiled
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
-    since_s = (at - s.now[0].rhythm.last_at) / plan.rate_hz
+    rhythm = s.now[0].rhythm
+    since_s = (at - rhythm.last_at) / plan.rate_hz
     doubted = since_s < LONG_AHEAD_S and last_may_be_p_wave(at, s)
-    if since_s < REFRACTORY_S and not doubted:
+    if since_s < SPLIT_S and not doubted:
         return
     # Leads that turned out to be lost since then no longer count.
     _refuse_knocks(at, plan, s)
     height = _fuse(at, plan, s)
     measure_stature(at, plan, s)
     instead = doubted and outdoes_last(since_s, height, s)
+    anew = False
+    if since_s < REFRACTORY_S and not instead and is_sharper_than_last(height, s):
+        rhythm.outdone = True
+        anew = rhythm.outdone_before >= OUTDONE
+    instead = instead or anew
     if instead:
         since_s = (at - s.now[0].before.last_at) / plan.rate_hz
     if since_s < REFRACTORY_S:
         return
-    if is_beat(since_s, height, False, plan, s) and resembles(at, height, False, plan, s):
+    if is_beat(since_s, height, False, plan, s) and resembles(at, since_s, height, False, plan, s):
         if instead:
             _take_back(s)
             measure_beat(at, s.found[s.now[0].found], plan, s)
-        _accept(at, height, False, instead, plan, s)
+        _accept(at, height, False, instead, anew, plan, s)
     else:
         _keep(at, height, s)
 
@@ -279,8 +245,9 @@ def _look_back(i: int, plan: Plan, s: State) -> None:
         wave = s.waves[best]
         # Of a wave that is kept only the sum over all leads is known.
         measure_stature(wave.at, plan, s)
-        if resembles(wave.at, wave.height, True, plan, s):
-            _accept(wave.at, wave.height, True, False, plan, s)
+        since_s = (wave.at - rhythm.last_at) / rate_hz
+        if resembles(wave.at, since_s, wave.height, True, plan, s):
+            _accept(wave.at, wave.height, True, False, False, plan, s)
             return
         wave.height = 0.0
     silent_s = (i - max(rhythm.last_at, now.learn_at)) / rate_hz
@@ -340,16 +307,21 @@ def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> N
 
 
 @compiled
-def _accept(at: int, height: float, late: bool, instead: bool, plan: Plan, s: State) -> None:
-    """A beat that was measured: learn from it, and report it."""
+def _accept(
+    at: int, height: float, late: bool, instead: bool, anew: bool, plan: Plan, s: State
+) -> None:
+    """A beat that was measured: learn from it, all ``anew`` if those before were none, and report
+    it."""
     now, rhythm, wave = s.now[0], s.now[0].rhythm, s.found[s.now[0].found]
-    anew = towers(height, s)
+    anew = towers(height, s) or anew
     now.before = now.rhythm
     for lead in s.leads:
         lead.before = lead.usual
     _learn_interval(at, plan, s)
     rhythm.last_at, rhythm.last_height, rhythm.last_likeness = at, height, wave.likeness
     rhythm.last_tall, rhythm.last_steep = now.tall, now.steep
+    rhythm.outdone_before = rhythm.outdone_before + 1 if rhythm.outdone else 0
+    rhythm.outdone = False
     if anew:
         rhythm.intervals, rhythm.usual_rr = 0, plan.rate_hz
     _drop_waves(at, s)

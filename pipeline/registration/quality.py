@@ -18,8 +18,9 @@ RUN_S = 0.12
 """A lead that repeats one value for so long shows nothing."""
 JUMP_SHARE = 0.1
 """From one sample to the next a step by more than this share of a beat's height is a jump."""
-BRIDGED_S = 0.01
-"""Samples that are missing for no longer, and a single one at any rate, are bridged by the last."""
+BRIDGED_S = 0.05
+"""Where samples are missing for no longer, or a single one, a line bridges them: shorter than the
+filters' delay, so that nothing has been decided about them when the lead comes back."""
 SETTLE_S = 0.2
 """So long after it came back a lead's filters still show that it was away."""
 STILL_S, LOOK_EVERY_S = 0.10, 0.005

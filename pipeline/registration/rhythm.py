@@ -101,14 +101,16 @@ def doubt(beats: Sequence[RhythmBeat]) -> str:
     """What speaks against the beats of a whole recording, for its user; empty for sound ones."""
     if not beats:
         return "no beat was found; does the record show a heart, with its leads connected?"
-    other = sum(beat.kind != "normal" for beat in beats)
-    valid = sum(beat.valid for beat in beats)
-    if 2 * other <= len(beats) <= 2 * valid:
+    reasons = []
+    if 2 * (other := sum(beat.kind != "normal" for beat in beats)) > len(beats):
+        reasons.append(f"{other} of {len(beats)} beats are not normal")
+    if 2 * (valid := sum(beat.valid for beat in beats)) < len(beats):
+        reasons.append(f"the phase could be relied on at {valid} of {len(beats)} beats alone")
+    if not reasons:
         return ""
     return (
-        f"{other} of {len(beats)} beats are not normal, and at {valid} the phase could be relied "
-        "on: this is noise, a heart without order, or a few seconds only; look at the record "
-        "before its beats are used"
+        f"{', and '.join(reasons)}: this is noise, a heart without order, or a few seconds only; "
+        "look at the record before its beats are used"
     )
 
 

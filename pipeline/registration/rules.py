@@ -44,6 +44,15 @@ SHORT, BLUNT, ATRIAL_THRESHOLD = 0.45, 0.7, 0.6
 """One that does, but is under the first share of the usual beat's height, and under the second of
 the steepness that such a height should have, is an atrial wave up to the third place."""
 
+# Of a ventricle, though its energy is low?
+WIDE_TALL, WIDE_ENERGY, WIDE_THRESHOLD = 0.5, 0.38, 0.1
+"""A wave as tall as the first share of the usual beat is one of a ventricle from the third place
+on, if it has the second share of the energy that such a height should have: beats that creep
+through muscle (s.d. 25 to 35 ms) have half of it, T waves (40 to 60 ms) a fifth to a third."""
+AGAIN, MOST_RESTLESS = 0.96, 0.2
+"""It has to look, by this correlation, like the wave before it of which that was true, and what
+lies between beats to be lower than the second share of them: noise has such waves, too."""
+
 # When a wave shows that the beat before it was its P wave.
 AHEAD_S, AHEAD = 0.25, 2.0
 """A low wave that another follows so soon, by such a factor higher, was that one's P wave: no
@@ -55,6 +64,13 @@ LOW = 0.7
 OWN = 0.98
 """Correlation from which a low wave is the heart's own beat, if it came when one was due: a tug at
 the electrode may follow it. P waves come too soon, and are 0.90 to 0.98 like beats."""
+
+SHARPER, OUTDONE = 1.5, 4
+"""A wave that follows a beat within the refractory time, as high and sharper by the first factor,
+casts doubt on it; where that happened to so many beats in succession, what was taken for beats are
+the T waves of those that follow: of a fast heart both lie within that time of each other."""
+SPLIT_S = 0.08
+"""Two waves closer than this are of one complex."""
 
 FIRST_BEATS, TOWERING = 12, 1.9
 """Among so many first beats two of so much energy are the beats; the others were P waves of a heart
@@ -68,17 +84,20 @@ def is_beat(since_s: float, height: float, overdue: bool, plan: Plan, s: State) 
     """Whether a wave so long after a beat is too high for noise and for that beat's T wave."""
     if height < _t_wave_bar(since_s, overdue, plan, s):
         return False
+    if _is_wide(since_s, height, plan, s):
+        return True
     return _exceeds(height, OVERDUE_SHARE * THRESHOLD if overdue else THRESHOLD, s)
 
 
 @compiled
-def resembles(at: int, height: float, overdue: bool, plan: Plan, s: State) -> bool:
+def resembles(at: int, since_s: float, height: float, overdue: bool, plan: Plan, s: State) -> bool:
     """Measure a wave that may be a beat: does it look like one, or is it high enough besides?"""
     now = s.now[0]
     wave = s.found[now.found]
     measure_beat(at, wave, plan, s)
     if wave.likeness < VERY_ALIKE:
-        return _exceeds(height, STRANGE_OVERDUE if overdue else STRANGE_THRESHOLD, s)
+        again = _is_wide(since_s, height, plan, s) and _came_before(s)
+        return again or _exceeds(height, STRANGE_OVERDUE if overdue else STRANGE_THRESHOLD, s)
     atrial = now.tall < SHORT and now.steep < BLUNT * now.tall
     return not atrial or _exceeds(height, ATRIAL_THRESHOLD, s)
 
@@ -91,17 +110,51 @@ def _exceeds(height: float, place: float, s: State) -> bool:
 
 
 @compiled
+def _t_wave_until_s(overdue: bool, plan: Plan, s: State) -> float:
+    """Until when after the last beat a wave is its T wave."""
+    slow = math.sqrt(max(s.now[0].rhythm.usual_rr / (USUAL_S * plan.rate_hz), 1.0))
+    return LATE_T_WAVE_S if overdue else min(T_WAVE_S * slow, LATE_T_WAVE_S)
+
+
+@compiled
+def _last_was_wide(s: State) -> bool:
+    """Whether the last beat was of another shape, or large: its T wave is large and may be late."""
+    rhythm = s.now[0].rhythm
+    return bool(rhythm.last_likeness < ALIKE or rhythm.last_height > LARGE)
+
+
+@compiled
 def _t_wave_bar(since_s: float, overdue: bool, plan: Plan, s: State) -> float:
     """Height that a wave so long after a beat needs to be none of its T wave."""
-    now, rhythm = s.now[0], s.now[0].rhythm
-    slow = math.sqrt(max(rhythm.usual_rr / (USUAL_S * plan.rate_hz), 1.0))
-    until_s = LATE_T_WAVE_S if overdue else min(T_WAVE_S * slow, LATE_T_WAVE_S)
+    now, until_s = s.now[0], _t_wave_until_s(overdue, plan, s)
     sharp = now.steep >= DULL * now.tall
-    bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(rhythm.last_height, LARGE)
+    bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(now.rhythm.last_height, LARGE)
     if since_s < until_s:
         return bar
-    wide = rhythm.last_likeness < ALIKE or rhythm.last_height > LARGE
-    return bar * (1.0 - (since_s - until_s) / FADE_S) if wide else 0.0
+    return bar * (1.0 - (since_s - until_s) / FADE_S) if _last_was_wide(s) else 0.0
+
+
+@compiled
+def _is_wide(since_s: float, height: float, plan: Plan, s: State) -> bool:
+    """Whether a wave after the last beat's T wave is tall and wide, as beats of a ventricle are."""
+    now = s.now[0]
+    over_s = _t_wave_until_s(False, plan, s) + (FADE_S if _last_was_wide(s) else 0.0)
+    if now.tall < WIDE_TALL or height < WIDE_ENERGY * now.tall or now.between > MOST_RESTLESS:
+        return False
+    return since_s > over_s and _exceeds(height, WIDE_THRESHOLD, s)
+
+
+@compiled
+def _came_before(s: State) -> bool:
+    """Whether the wave measured last looks like the wide wave before it, which it now replaces."""
+    likeness, weights = 0.0, 0.0
+    for k in range(len(s.leads)):
+        lead = s.leads[k]
+        if lead.weight > 0.0:
+            likeness += lead.weight * (lead.here.shape * lead.wide).sum()
+            weights += lead.weight
+            lead.wide[:] = lead.here.shape
+    return weights > 0.0 and likeness > AGAIN * weights
 
 
 @compiled
@@ -119,6 +172,14 @@ def outdoes_last(since_s: float, height: float, s: State) -> bool:
     rhythm, now = s.now[0].rhythm, s.now[0]
     duller = rhythm.last_steep * now.tall < DULL * (rhythm.last_tall * now.steep)
     return height > AHEAD * rhythm.last_height and (since_s < AHEAD_S or duller)
+
+
+@compiled
+def is_sharper_than_last(height: float, s: State) -> bool:
+    """Whether a wave is as high as the last beat, and sharper than it, as R is than T."""
+    rhythm, now = s.now[0].rhythm, s.now[0]
+    sharper = now.steep * rhythm.last_tall > SHARPER * (rhythm.last_steep * now.tall)
+    return bool(height >= rhythm.last_height and sharper)
 
 
 @compiled
