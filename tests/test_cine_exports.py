@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import SimpleITK as sitk
 from cine_files import (
     ALL_FRAMES,
     COLUMNS,
@@ -215,55 +214,6 @@ def test_images_of_another_patient_are_refused_even_where_they_would_be_left_out
         read_dicom_cine(tmp_path)
 
 
-@pytest.mark.parametrize("signed", [False, True])
-def test_images_that_are_stored_white_for_black_are_turned(tmp_path: Path, signed: bool) -> None:
-    def turned(data: FileDataset, number: int, phase: int) -> bool:
-        data.PhotometricInterpretation = "MONOCHROME1"
-        data.BitsStored, data.PixelRepresentation = 12, int(signed)
-        # PS3.3 C.7.6.3.1.2: the least sample value is shown white.
-        stored = (-1 if signed else 4095) - pixel_value(phase, number).astype(np.int16)
-        data.PixelData = stored.tobytes()
-        return True
-
-    write_dicom(tmp_path, turned)
-    assert_is_the_stack(read_dicom_cine(tmp_path))
-
-
-def test_lossless_jpeg_is_read_exactly_with_its_rescaling(tmp_path: Path) -> None:
-    def packed(data: FileDataset, number: int, phase: int) -> bool:
-        writer = sitk.ImageFileWriter()
-        writer.SetImageIO("GDCMImageIO")
-        writer.SetFileName(str(tmp_path / "packed.dcm"))
-        writer.UseCompressionOn()
-        writer.SetCompressor("JPEG")
-        writer.Execute(sitk.GetImageFromArray(2 * data.pixel_array[None] + 6))
-        other = dcmread(tmp_path / "packed.dcm")
-        (tmp_path / "packed.dcm").unlink()
-        data.file_meta.TransferSyntaxUID = other.file_meta.TransferSyntaxUID
-        assert data.file_meta.TransferSyntaxUID == "1.2.840.10008.1.2.4.70"
-        data["PixelData"] = other["PixelData"]
-        for name in ("BitsStored", "HighBit", "BitsAllocated", "PixelRepresentation"):
-            setattr(data, name, getattr(other, name))
-        data.RescaleSlope, data.RescaleIntercept = "0.5", "-3"
-        return True
-
-    write_dicom(tmp_path / "cine", packed)
-    assert_is_the_stack(read_dicom_cine(tmp_path / "cine"))
-    path = next((tmp_path / "cine").glob("*.dcm"))
-    data = dcmread(path)
-    data.PixelData = data.PixelData[:30]
-    data["PixelData"].is_undefined_length = True
-    data.save_as(path)
-    with pytest.raises(InputError, match=r"pixels cannot be read.*JPEG Lossless"):
-        read_dicom_cine(tmp_path / "cine")
-    # The library that unpacks it turns white for black, or does not: nothing is taken on trust.
-    other = dcmread(next(one for one in (tmp_path / "cine").glob("*.dcm") if one != path))
-    other.PhotometricInterpretation = "MONOCHROME1"
-    other.save_as(path)
-    with pytest.raises(InputError, match=r"pixels cannot be read.*JPEG Lossless"):
-        read_dicom_cine(tmp_path / "cine")
-
-
 def in_colour() -> FileDataset:
     data = dicom_frame(0, 0)
     data.SamplesPerPixel, data.PhotometricInterpretation = 3, "RGB"
@@ -433,3 +383,13 @@ def test_one_rr_interval_for_all_serves_prospective_triggering(tmp_path: Path) -
     write_dicom(tmp_path, prospective)
     cine = read_dicom_cine(tmp_path, rr_ms=900.0).cine
     np.testing.assert_allclose(cine.phases, 150 * np.arange(PHASES) / 900)
+
+
+def test_images_in_real_time_do_not_go_before_a_cine_for_their_number(tmp_path: Path) -> None:
+    """Their times run through many beats."""
+    beats = coarser(series([*range(SLICES)], [50.0 * k for k in range(4 * PHASES)]))
+    folder = beside_the_stack(tmp_path, beats)
+    stack = read_dicom_cine(folder)
+    assert_is_the_stack(stack)
+    assert 'series 9 "other"' in stack.left_out[0]
+    assert "slices that the stack has already" in stack.left_out[0]

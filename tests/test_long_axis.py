@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from cine_files import COLUMNS, PHASES, ROWS, RR_MS, dicom_frame, in_series, write_dicom
+from pydicom import dcmread
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -70,7 +71,33 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     np.testing.assert_allclose(view.phases, np.arange(PHASES) * RR_MS / PHASES / 1000)
     assert view.rr_s == 1.0
     np.testing.assert_allclose(view.mr_from_index[:3, 0], [0, 1.25, 0], atol=1e-9)
-    assert len(stack.left_out) == 5
+    *apart, why = stack.left_out
+    assert len(apart) == 5
+    assert why.startswith('series 51 "view 1": no long-axis view: it has another Frame')
+
+
+@pytest.mark.parametrize(
+    ("every", "third", "words"),
+    [
+        ({}, {"TriggerTime": 1000.5}, r"its trigger times, from 0 to 1000.5 ms, do not fit in its"),
+        ({}, {"TriggerTime": -3}, "its trigger times, from -3 to "),
+        ({}, {"TriggerTime": ""}, "it has no trigger times"),
+        ({}, {"NominalInterval": 0}, "it has no RR interval; cine.rr_ms in study.yaml gives one"),
+        ({"NominalInterval": 9}, {}, "its RR interval is 9 ms"),
+    ],
+)
+def test_a_cine_across_the_stack_that_is_no_view_is_told_with_the_reason(
+    tmp_path: Path, every: dict[str, Any], third: dict[str, Any], words: str
+) -> None:
+    write_dicom(tmp_path)
+    add_view(tmp_path, 0, **every)
+    data = dcmread(tmp_path / "view_0_2.dcm")
+    for name, value in third.items():
+        setattr(data, name, value)
+    data.save_as(tmp_path / "view_0_2.dcm")
+    stack, views = read_dicom_study(tmp_path)
+    assert views == ()
+    assert stack.left_out[-1].startswith(f'series 50 "view 0": no long-axis view: {words}')
 
 
 def test_a_view_is_timed_by_what_tells_its_images_apart(tmp_path: Path) -> None:

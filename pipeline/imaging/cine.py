@@ -23,6 +23,10 @@ from pipeline.imaging.frames import (
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.spacing import fill_gaps, regular_steps
 
+EVENLY = (
+    "give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
+    "InstanceNumber where no image of a slice tells its time"
+)
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
 
@@ -180,10 +184,11 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
             f"{trigger_times_ms[number, phase]:g}; give a number of milliseconds"
         )
     if phases.min() < 0 or phases.max() >= 1:
+        number = int(np.argmax(np.abs(phases - 0.5).max(axis=1)))
         raise InputError(
-            f"{where}: trigger times from {trigger_times_ms.min():g} to "
-            f"{trigger_times_ms.max():g} ms do not fit in an RR interval of "
-            f"{rr_ms[np.argmax(phases.max(axis=1))]:g} ms; correct them, or give cine.rr_ms "
+            f"{where}: trigger times from {trigger_times_ms[number].min():g} to "
+            f"{trigger_times_ms[number].max():g} ms do not fit in an RR interval of "
+            f"{rr_ms[number]:g} ms (slice {number}); correct them, or give cine.rr_ms "
             "in study.yaml"
         )
     common = phases.mean(axis=0)
@@ -215,7 +220,7 @@ def _require_timing(frames: Sequence[Frame]) -> None:
         if not frame.times_ms:
             raise InputError(
                 f"{frame.where}: has no trigger time; export the cine with TriggerTime "
-                "(0018,1060), or give it as NIfTI with a timing file"
+                f"(0018,1060), or {EVENLY}"
             )
         _rr_ms(frame)
 
@@ -272,8 +277,8 @@ def _remedy(one: Sequence[Frame], name: str) -> str:
     if len({frame.times_ms[name] for frame in one}) > 1:
         return "keep one series a slice"
     return (
-        "its times do not tell its phases apart: export them with TriggerTime (0018,1060), or give "
-        "the cine as NIfTI with a timing file"
+        "its times do not tell its phases apart: export them with TriggerTime (0018,1060), or "
+        + EVENLY
     )
 
 

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
-from pydicom.misc import is_dicom
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
-from pipeline.imaging.dicom_pixels import rescaled, stored_pixels, upright
+from pipeline.imaging.dicom_files import DIRECTORY, DIRECTORY_NAMES, is_bare, told_from_notes
+from pipeline.imaging.dicom_pixels import rescaled, stored_pixels, upright, without_padding
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
+from pipeline.imaging.untimed import spread_evenly
 from pipeline.study_files import files_below
 
 Groups = Callable[[str], Any]
@@ -29,29 +31,6 @@ MR_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
     "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
 }
-DIRECTORY, DIRECTORY_NAMES = "1.2.840.10008.1.3.10", ("DICOMDIR", "DICOMDIR;1")
-"""Media Storage Directory Storage, and what systems make of its file's name."""
-
-OTHER_IMAGES = (".nrrd", ".nhdr", ".mha", ".mhd", ".hdr", ".img", ".img.gz", ".mgz", ".mat", ".par")
-"""Ends of names of images that other programs write."""
-
-NOTES = (
-    *(".txt", ".csv", ".tsv", ".xml", ".json", ".yaml", ".yml", ".md", ".html", ".htm", ".log"),
-    *(".pdf", ".rtf", ".doc", ".docx", ".xls", ".xlsx", ".png", ".jpg", ".jpeg", ".gif", ".bmp"),
-)
-"""Ends of names of what people keep beside images; no scanner's file is called so."""
-
-VIEWERS = (
-    *(".exe", ".dll", ".msi", ".bat", ".cmd", ".inf", ".ini", ".cfg", ".jar", ".class", ".ico"),
-    *(".lnk", ".chm", ".css", ".js", ".svg", ".ttf", ".sys", ".so", ".dylib", ".properties"),
-)
-"""Ends of names of the programs that archives put on a disc with the images."""
-
-TEXT_BYTES = 4096
-"""Of a file without an ending, these many tell whether it is text, as a disc's README."""
-
-ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".rar", ".7z")
-
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
@@ -91,7 +70,7 @@ def read_dicom_study(
     paths = [path for path in files_below(folder) if path.name.upper() not in DIRECTORY_NAMES]
     if not paths:
         raise InputError(f"{folder}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file")
-    images, notes = _told_from_notes(paths)
+    images, notes = told_from_notes(paths)
     frames: list[Frame] = []
     numbers: set[int | None] = set()
     others = [LeftOut(str(path), "notes", "", "not DICOM", "file") for path in notes]
@@ -116,9 +95,15 @@ def read_dicom_study(
     if not frames:
         found = "; ".join(left_out_lines(others, str(folder)))
         raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
-    source = None if rr_ms is None else "study.yaml"
+    source, remark = None, ""
+    if rr_ms is not None:
+        source = "study.yaml"
+        frames, remark = spread_evenly(frames, rr_ms)
     stack = stack_frames(frames, str(folder), source, others, fill)
-    return stack, long_axis_views(frames, stack.cine)
+    if remark:
+        stack = replace(stack, remarks=(remark, *stack.remarks))
+    views, no_views = long_axis_views(frames, stack.cine)
+    return replace(stack, left_out=(*stack.left_out, *no_views)), views
 
 
 def _require_series(asked: Sequence[int], there: set[int | None], where: str) -> None:
@@ -131,57 +116,17 @@ def _require_series(asked: Sequence[int], there: set[int | None], where: str) ->
         )
 
 
-def _told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """DICOM files, and what is kept beside them; InputError, for all at once, where one is neither.
-
-    A file without an ending of its own that does not begin as DICOM does may be a damaged image.
-    """
-    images = [path for path in paths if _begins_as_dicom(path)]
-    known = set(images)
-    strange = [path for path in paths if path not in known]
-    notes = [path for path in strange if _is_note(path)]
-    others = [path for path in strange if not _is_note(path)]
-    if not others:
-        return images, notes
-    more = f" and {len(others) - 1} more ({_names(others[1:])})" if len(others) > 1 else ""
-    image = next((one for one in others if one.name.lower().endswith(OTHER_IMAGES)), None)
-    if image:
-        raise InputError(
-            f"{image}: is an image, but neither DICOM nor NIfTI; save the cine as "
-            "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
-        )
-    archive = next((one for one in others if one.name.lower().endswith(ARCHIVES)), None)
-    if archive:
-        raise InputError(f"{archive}: is an archive; unpack it, and take it out of the folder")
-    raise InputError(
-        f"{others[0]}{more}: is not DICOM, or damaged; copy it again from the scanner, or take "
-        "it out of the folder where it does not belong there"
-    )
-
-
-def _is_note(path: Path) -> bool:
-    if path.suffix:
-        return path.name.lower().endswith((*NOTES, *VIEWERS))
-    with path.open("rb") as handle:
-        begins = handle.read(TEXT_BYTES)
-    # An image that lost its beginning holds bytes that no text does.
-    return bool(begins) and begins.isascii() and not set(begins) & set(range(9))
-
-
-def _names(paths: Sequence[Path]) -> str:
-    return ", ".join([*(path.name for path in paths[:8]), *(["..."] * (len(paths) > 8))])
-
-
-def _begins_as_dicom(path: Path) -> bool:
-    try:
-        return bool(is_dicom(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its rights") from error
-
-
 def _read(path: Path) -> Any:
     try:
-        return pydicom.dcmread(path)
+        dataset = pydicom.dcmread(path, force=is_bare(path))
+        if "TransferSyntaxUID" not in dataset.file_meta:
+            implicit, _ = dataset.original_encoding
+            dataset.file_meta.TransferSyntaxUID = (
+                pydicom.uid.ImplicitVRLittleEndian
+                if implicit
+                else pydicom.uid.ExplicitVRLittleEndian
+            )
+        return dataset
     except (InvalidDicomError, OSError, EOFError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: is not DICOM, or damaged; copy it again from the scanner, or take it out of "
@@ -216,7 +161,7 @@ def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
             f"{path}: holds no image (truncated, or not an image object); "
             "copy it again, or take it out of the cine folder"
         )
-    pixels = upright(stored_pixels(dataset, path), dataset)
+    pixels = upright(without_padding(stored_pixels(dataset, path), dataset), dataset)
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         if len(pixels) > 1:
             raise InputError(
@@ -281,6 +226,7 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
             frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
             patient=str(dataset.get("PatientID", "") or "").strip(),
+            number=_whole(dataset.get("InstanceNumber")),
         )
     except (ValueError, TypeError, IndexError) as error:
         raise _not_understood(where, error) from error
@@ -352,10 +298,13 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
 def _series_number(dataset: Any) -> int | None:
     """None where the file does not tell, or tells no number: it is a label, no more."""
     try:
-        number = dataset.get("SeriesNumber")
-        return None if number in (None, "") else int(number)
+        return _whole(dataset.get("SeriesNumber"))
     except (ValueError, TypeError):
         return None
+
+
+def _whole(number: Any) -> int | None:
+    return None if number in (None, "") else int(number)
 
 
 def _series_name(dataset: Any) -> str:

@@ -61,9 +61,35 @@ def _read_by_gdcm(dataset: Any, path: Path) -> Any:
     return np.rint((values - intercept) / slope) if (slope, intercept) != (1, 0) else values
 
 
+def without_padding(stored: Any, dataset: Any) -> Any:
+    """Stored values; those that only pad the image are as dark as its darkest place.
+
+    DICOM PS3.3 C.7.5.1.1.2: a PixelPaddingValue, or the range from it to PixelPaddingRangeLimit,
+    is no measurement.
+    """
+    if dataset.get("PixelPaddingValue") in (None, ""):
+        return stored
+    first = int(dataset.PixelPaddingValue)
+    limit = dataset.get("PixelPaddingRangeLimit")
+    last = first if limit in (None, "") else int(limit)
+    # A header may give the unsigned number of a value that is signed, or the other way round.
+    bits = 2 ** int(dataset.BitsAllocated)
+    padding = np.zeros(stored.shape, bool)
+    for turn in (-bits, 0, bits):
+        padding |= (stored >= min(first, last) + turn) & (stored <= max(first, last) + turn)
+    if not padding.any() or padding.all():
+        return stored
+    dark = stored[~padding].max() if _is_white_for_black(dataset) else stored[~padding].min()
+    return np.where(padding, dark, stored)
+
+
+def _is_white_for_black(dataset: Any) -> bool:
+    return bool(dataset.get("PhotometricInterpretation") == "MONOCHROME1")
+
+
 def upright(stored: Any, dataset: Any) -> Any:
     """Stored values as they grow with brightness."""
-    if dataset.get("PhotometricInterpretation") != "MONOCHROME1":
+    if not _is_white_for_black(dataset):
         return stored
     most = 2 ** int(dataset.BitsStored) - 1
     # Complement of two: the largest is one less than the smallest's magnitude.

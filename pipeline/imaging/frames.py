@@ -33,9 +33,9 @@ USUAL_RR_MS = 900.0
 
 LEAVE_OUT = "take the other's files out, or name its number in cine.leave_out_series in study.yaml"
 
-Rank = tuple[bool, int, bool, int, float]
-"""Whether a set is a cine stack, the images of the largest one in its direction, whether original,
-its own number of images, pixels per mm2."""
+Rank = tuple[bool, int, bool, bool, int, float]
+"""Whether a set is a cine stack, the images of the largest one in its direction, whether it shows
+one beat, whether original, its own number of images, pixels per mm2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +78,9 @@ class Frame:
     patient: str = ""
     """The patient's identifier; empty when the file does not tell."""
 
+    number: int | None = None
+    """Its number within its series; None when the file does not tell."""
+
     @property
     def normal(self) -> Float:
         """Unit normal of the slice, right-handed."""
@@ -96,10 +99,10 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
 
     The stack is the largest set of images alike (parallel, of one matrix, pixel spacing and
     kind) that is a cine: 3 slices or more, 2 moments or more in a slice, a tenth of a beat apart
-    or more. In one direction original images go before derived ones, which stand in for slices of
-    which there are no original ones; of two sets as large the one of smaller pixels is taken. Left
-    out are copies, sets of another direction, and parallel sets that are no cine or show only
-    slices that the stack has.
+    or more. In one direction sets within one beat go before images in real time, and original
+    images before derived ones, which stand in for slices of which there are no original ones; of
+    two sets as large the one of smaller pixels is taken. Left out are copies, sets of another
+    direction, and parallel sets that are no cine or show only slices that the stack has.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
         spacing or pixel direction; or two stacks of different directions are equally large.
     """
     frames, copies = _without_copies(frames)
-    ranked = _ranked(_alike(frames))
+    ranked = _ranked(sets_alike(frames))
     _require_one_largest(ranked, where)
     stack, stills = _without_stills(ranked[0][1])
     left_out = copies + _spared(stills, "one moment of the beat, no cine")
@@ -154,7 +157,7 @@ def _without_copies(frames: Sequence[Frame]) -> tuple[list[Frame], list[LeftOut]
     return kept, copies
 
 
-def _alike(frames: Sequence[Frame]) -> list[list[Frame]]:
+def sets_alike(frames: Sequence[Frame]) -> list[list[Frame]]:
     """Sets of images that could be stacked: same pixel axes, matrix, spacing and kind."""
     sets: list[list[Frame]] = []
     for frame in frames:
@@ -217,6 +220,15 @@ def _spans_beat(frames: Sequence[Frame]) -> bool:
     return float(np.median(spans_ms)) >= LEAST_OF_A_BEAT * beat_ms
 
 
+def _in_one_beat(frames: Sequence[Frame]) -> bool:
+    """Whether times lie within the RR interval, as those of images in real time do not."""
+    return all(
+        frame.rr_ms is None or time_ms < frame.rr_ms
+        for frame in frames
+        for time_ms in list(frame.times_ms.values())[:1]
+    )
+
+
 def _time_range_ms(frames: Sequence[Frame]) -> tuple[float, float]:
     """First and last time by the attribute that tells the frames furthest apart."""
     names = set(frames[0].times_ms).intersection(*(frame.times_ms for frame in frames))
@@ -232,7 +244,7 @@ def is_stack(frames: Sequence[Frame]) -> bool:
 
 def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame], folder: str) -> tuple[str, ...]:
     """Which other original images would make up a cine stack of another direction, in words."""
-    others = [one for one in _alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
+    others = [one for one in sets_alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
     return tuple(
         f"{one[0].series} ({inside(one[0].where, folder)}, ...) is a cine of "
         f"{len(slice_positions(one))} slices too, in another direction than {stack[0].series}, "
@@ -252,7 +264,8 @@ def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
         per_mm2 = 1 / (one[0].spacing_mm[0] * one[0].spacing_mm[1])
         enough = any(one is other for other in stacks)
         original = one[0].kind == ORIGINAL
-        ranked.append(((enough, max(along, default=0), original, len(one), per_mm2), one))
+        rank = (enough, max(along, default=0), _in_one_beat(one), original, len(one), per_mm2)
+        ranked.append((rank, one))
     return sorted(ranked, key=itemgetter(0), reverse=True)
 
 
@@ -264,9 +277,9 @@ def _weight(frames: Sequence[Frame]) -> int:
 def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str) -> None:
     rank, (first, *_) = ranked[0]
     for other_rank, (other, *_) in ranked[1:]:
-        if rank[0] and other_rank[:4] == rank[:4] and not _parallel(first, other):
+        if rank[0] and other_rank[:5] == rank[:5] and not _parallel(first, other):
             raise InputError(
-                f"{where}: holds two stacks of {rank[3]} images in different directions, "
+                f"{where}: holds two stacks of {rank[4]} images in different directions, "
                 f"{first.series} ({first.where}) and {other.series} ({other.where}); "
                 f"keep the one to be used: {LEAVE_OUT}"
             )

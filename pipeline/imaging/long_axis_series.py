@@ -34,8 +34,11 @@ class LongAxis:
     """One slice; its phases are those of its own trigger times and RR interval."""
 
 
-def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...]:
-    """The long-axis views among a scanner's images.
+def long_axis_views(
+    frames: Iterable[Frame], stack: Cine
+) -> tuple[tuple[LongAxis, ...], tuple[str, ...]]:
+    """The long-axis views among a scanner's images, and why other cines across the stack are none,
+    a line each.
 
     Original images of one slice at `MIN_PHASES` moments or more, with trigger times within their
     RR interval, at least `LEAST_ANGLE_DEG` from the stack's slices, and in the same frame of
@@ -48,15 +51,29 @@ def long_axis_views(frames: Iterable[Frame], stack: Cine) -> tuple[LongAxis, ...
     normal /= np.linalg.norm(normal)
     reference = _reference(frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE)
     slices: list[list[Frame]] = []
+    elsewhere: list[Frame] = []
     for frame in sorted(frames, key=lambda one: one.where):
         across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
-        if across and frame.kind == ORIGINAL and frame.frame_of_reference in ("", reference):
-            of_its_slice = next((one for one in slices if _same_slice(one[0], frame)), None)
-            if of_its_slice is None:
-                slices.append([frame])
-            else:
-                of_its_slice.append(frame)
-    return tuple(view for one in slices for view in _views(one))
+        if not across or frame.kind != ORIGINAL:
+            continue
+        if frame.frame_of_reference not in ("", reference):
+            elsewhere.append(frame)
+            continue
+        of_its_slice = next((one for one in slices if _same_slice(one[0], frame)), None)
+        if of_its_slice is None:
+            slices.append([frame])
+        else:
+            of_its_slice.append(frame)
+    found = [_views(one) for one in slices]
+    views = tuple(view for some, _ in found for view in some)
+    reasons = [reason for _, some in found for reason in some]
+    reasons += [
+        f"{one[0].series}: no long-axis view: it has another FrameOfReferenceUID than the stack, "
+        "as of a patient laid down anew"
+        for one in _by_series(elsewhere)
+        if len(one) >= MIN_PHASES
+    ]
+    return views, tuple(reasons)
 
 
 def _cosine(frame: Frame, normal: Float) -> float:
@@ -78,46 +95,64 @@ def _same_slice(first: Frame, frame: Frame) -> bool:
     )
 
 
-def _views(frames: Sequence[Frame]) -> list[LongAxis]:
-    """What the images of one slice make up: a view a series, or one where these are its parts.
-
-    Of two series of the same images, as of a classic and an Enhanced object, one is taken.
-    """
+def _by_series(frames: Iterable[Frame]) -> list[list[Frame]]:
     by_series: dict[str, list[Frame]] = {}
     for frame in frames:
         by_series.setdefault(frame.series_uid, []).append(frame)
+    return list(by_series.values())
+
+
+def _views(frames: Sequence[Frame]) -> tuple[list[LongAxis], list[str]]:
+    """What the images of one slice make up: a view a series, or one where these are its parts; and
+    why series are none.
+
+    Of two series of the same images, as of a classic and an Enhanced object, one is taken.
+    """
     views: list[LongAxis] = []
-    for one in by_series.values():
+    reasons = []
+    for one in _by_series(frames):
         view = _view(one)
-        if view and not any(
+        if isinstance(view, str):
+            reasons.append(f"{one[0].series}: no long-axis view: {view}")
+        elif view and not any(
             np.array_equal(view.cine.intensity, other.cine.intensity) for other in views
         ):
             views.append(view)
     spans = sorted((view.cine.phases[0], view.cine.phases[-1]) for view in views)
     if all(later[0] > earlier[1] for earlier, later in pairwise(spans)) and len(views) != 1:
         together = _view(frames)
-        return [together] if together else views
-    return views
+        if isinstance(together, LongAxis):
+            return [together], []
+    return views, reasons
 
 
-def _view(frames: Sequence[Frame]) -> LongAxis | None:
-    """The images of one slice in order of time; None when they are no cine."""
+def _view(frames: Sequence[Frame]) -> LongAxis | str | None:
+    """The images of one slice in order of time; None when they are no cine, or what in words keeps
+    a cine from being a view."""
     first = frames[0]
-    timed = [frame for frame in frames if frame.times_ms and frame.rr_ms is not None]
-    names = [name for name in first.times_ms if all(name in one.times_ms for one in timed)]
-    if len(timed) < len(frames) or not names:
+    if len(frames) < MIN_PHASES:
         return None
+    if any(frame.rr_ms is None for frame in frames):
+        return "it has no RR interval; cine.rr_ms in study.yaml gives one"
+    names = [name for name in first.times_ms if all(name in one.times_ms for one in frames)]
+    if not names:
+        return "it has no trigger times"
     # The most trusted of those that tell most images apart, as for the stack.
-    name = max(names, key=lambda one: len({frame.times_ms[one] for frame in timed}))
-    moments = {frame.times_ms[name]: frame for frame in reversed(timed)}
+    name = max(names, key=lambda one: len({frame.times_ms[one] for frame in frames}))
+    moments = {frame.times_ms[name]: frame for frame in reversed(frames)}
+    if len(moments) < MIN_PHASES:
+        return None
     ordered = [moments[time_ms] for time_ms in sorted(moments)]
     rr_ms = float(np.mean([frame.rr_ms for frame in ordered if frame.rr_ms is not None]))
-    low_s, high_s = PLAUSIBLE_RR_S
-    phases = np.array([frame.times_ms[name] for frame in ordered]) / rr_ms
-    rising = all(later > earlier for earlier, later in pairwise(phases))
-    inside = phases[0] >= 0 and phases[-1] < 1 and low_s < rr_ms / 1000 < high_s
-    if len(ordered) < MIN_PHASES or not rising or not inside:
-        return None
+    low_ms, high_ms = (1000 * limit_s for limit_s in PLAUSIBLE_RR_S)
+    if not low_ms < rr_ms < high_ms:
+        return f"its RR interval is {rr_ms:g} ms"
+    times_ms = sorted(moments)
+    if not all(0 <= time_ms < rr_ms for time_ms in times_ms):
+        return (
+            f"its trigger times, from {times_ms[0]:g} to {times_ms[-1]:g} ms, do not fit in its RR "
+            f"interval of {rr_ms:g} ms"
+        )
     intensity = np.stack([np.asarray(frame.pixels, np.float32) for frame in ordered])[:, None]
     place = placement(first, first.normal)
-    return LongAxis(first.series, Cine(intensity, place, phases, rr_ms / 1000))
+    return LongAxis(first.series, Cine(intensity, place, np.array(times_ms) / rr_ms, rr_ms / 1000))

@@ -1,0 +1,106 @@
+"""Ways in which DICOM files store images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from cine_files import assert_is_the_stack, pixel_value, read_dicom_cine, write_dicom
+from pydicom import dcmread, dcmwrite
+from pydicom.dataset import Dataset, FileDataset
+
+from pipeline.errors import InputError
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_images_that_are_stored_white_for_black_are_turned(tmp_path: Path, signed: bool) -> None:
+    def turned(data: FileDataset, number: int, phase: int) -> bool:
+        data.PhotometricInterpretation = "MONOCHROME1"
+        data.BitsStored, data.PixelRepresentation = 12, int(signed)
+        # PS3.3 C.7.6.3.1.2: the least sample value is shown white.
+        stored = (-1 if signed else 4095) - pixel_value(phase, number).astype(np.int16)
+        data.PixelData = stored.tobytes()
+        return True
+
+    write_dicom(tmp_path, turned)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+def test_lossless_jpeg_is_read_exactly_with_its_rescaling(tmp_path: Path) -> None:
+    def packed(data: FileDataset, number: int, phase: int) -> bool:
+        writer = sitk.ImageFileWriter()
+        writer.SetImageIO("GDCMImageIO")
+        writer.SetFileName(str(tmp_path / "packed.dcm"))
+        writer.UseCompressionOn()
+        writer.SetCompressor("JPEG")
+        writer.Execute(sitk.GetImageFromArray(2 * data.pixel_array[None] + 6))
+        other = dcmread(tmp_path / "packed.dcm")
+        (tmp_path / "packed.dcm").unlink()
+        data.file_meta.TransferSyntaxUID = other.file_meta.TransferSyntaxUID
+        assert data.file_meta.TransferSyntaxUID == "1.2.840.10008.1.2.4.70"
+        data["PixelData"] = other["PixelData"]
+        for name in ("BitsStored", "HighBit", "BitsAllocated", "PixelRepresentation"):
+            setattr(data, name, getattr(other, name))
+        data.RescaleSlope, data.RescaleIntercept = "0.5", "-3"
+        return True
+
+    write_dicom(tmp_path / "cine", packed)
+    assert_is_the_stack(read_dicom_cine(tmp_path / "cine"))
+    path = next((tmp_path / "cine").glob("*.dcm"))
+    data = dcmread(path)
+    data.PixelData = data.PixelData[:30]
+    data["PixelData"].is_undefined_length = True
+    data.save_as(path)
+    with pytest.raises(InputError, match=r"pixels cannot be read.*JPEG Lossless"):
+        read_dicom_cine(tmp_path / "cine")
+    # The library that unpacks it turns white for black, or does not: nothing is taken on trust.
+    other = dcmread(next(one for one in (tmp_path / "cine").glob("*.dcm") if one != path))
+    other.PhotometricInterpretation = "MONOCHROME1"
+    other.save_as(path)
+    with pytest.raises(InputError, match=r"pixels cannot be read.*JPEG Lossless"):
+        read_dicom_cine(tmp_path / "cine")
+
+
+@pytest.mark.parametrize("white_for_black", [False, True])
+@pytest.mark.parametrize("limit", [None, -32760])
+def test_padding_is_as_dark_as_the_darkest_place(
+    tmp_path: Path, white_for_black: bool, limit: int | None
+) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        stored = pixel_value(phase, number).astype(np.int16)
+        if white_for_black:
+            data.PhotometricInterpretation = "MONOCHROME1"
+            stored = -1 - stored
+        stored[0, 1:3] = -32768, -32768 if limit is None else limit
+        data.PixelRepresentation, data.PixelPaddingValue = 1, -32768
+        if limit is not None:
+            data.PixelPaddingRangeLimit = limit
+        data.PixelData = stored.tobytes()
+        return True
+
+    write_dicom(tmp_path, change)
+    found = read_dicom_cine(tmp_path).cine.intensity[2, 1]
+    expected = pixel_value(2, 1)
+    # The first pixel is the darkest one.
+    expected[0, 1:3] = expected[0, 0]
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+def test_objects_without_preamble_and_meta_information_are_read(
+    tmp_path: Path, implicit: bool
+) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        dcmwrite(
+            tmp_path / f"{number}_{phase}",
+            Dataset({element.tag: element for element in data}),
+            implicit_vr=implicit,
+            little_endian=True,
+            enforce_file_format=False,
+        )
+        return False
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
