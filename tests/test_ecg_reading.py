@@ -196,6 +196,17 @@ def test_missing_file_is_named(tmp_path, name):
         read_ecg(tmp_path / name)
 
 
+def test_signals_without_a_name_or_a_gain_are_read(tmp_path):
+    """The WFDB library's manual, header(5): a record may tell its files and formats alone, and is
+    then taken for one of 200 steps a millivolt."""
+    steps = np.random.default_rng(2).integers(-900, 900, (2000, 2)).astype("<i2")
+    (tmp_path / "bare.dat").write_bytes(steps.tobytes())
+    (tmp_path / "bare.hea").write_text("bare 2 360 2000\nbare.dat 16\nbare.dat 16\n")
+    ecg = read_ecg(tmp_path / "bare")
+    assert ecg.leads == ("signal 1", "signal 2")
+    np.testing.assert_allclose(ecg.signal_mv, steps / 200)
+
+
 def test_truncated_wfdb_signal_is_refused(tmp_path):
     stem = write_wfdb(tmp_path)
     data = stem.with_suffix(".dat")

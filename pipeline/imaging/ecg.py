@@ -136,7 +136,9 @@ def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:
     kept = voltages if gaps and voltages else list(range(record.n_sig))
     factors = [_millivolts(record.units[k], str(header)) for k in kept]
     signal_mv = np.asarray(record.p_signal, dtype=float)[:, kept] * factors
-    return Ecg(signal_mv, tuple(record.sig_name[k] for k in kept), float(record.fs))
+    # A header need not name its signals.
+    names = tuple(record.sig_name[k] or f"signal {k + 1}" for k in kept)
+    return Ecg(signal_mv, names, float(record.fs))
 
 
 def _read_csv(path: Path) -> Ecg:
@@ -309,7 +311,10 @@ def _is_voltage(unit: str) -> bool:
 def _millivolts(unit: str, where: str) -> float:
     """Millivolts in one ``unit``."""
     if not _is_voltage(unit):
-        raise InputError(f"{where}: a lead is in {unit!r}; it needs a voltage: V, mV, uV or nV")
+        raise InputError(
+            f"{where}: a lead is in {unit!r}; it needs a voltage: V, mV, uV or nV (of a record "
+            "that was not calibrated, write mV: the scale of a lead changes no R peak)"
+        )
     return MILLIVOLTS[_unit(unit)]
 
 
