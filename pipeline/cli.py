@@ -341,6 +341,9 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
     if is_of_record(out, record):
         raise InputError(f"--out {out}: is the recording itself; choose another name for the table")
     ecg = read_ecg(record, gaps=True)
+    lasts_s, leads = len(ecg.signal_mv) / ecg.sampling_rate_hz, ", ".join(ecg.leads)
+    # Compiling, the first time, takes longer than most records.
+    show(f"record    {lasts_s:.1f} s at {ecg.sampling_rate_hz:g} Hz: {leads}")
     try:
         beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)
     except InputError as error:

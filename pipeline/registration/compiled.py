@@ -11,7 +11,8 @@ from pipeline.compiled import door
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_SOURCES = ("detector_state", "waves", "quality", "levels", "rules", "qrs", "ticks")
+_DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules", "qrs")
+_SOURCES = (*_DETECTOR, "ticks")
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
