@@ -6,7 +6,19 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from arrhythmia_records import CASES, NORMAL, QRS, Waves, draw, matched, record, scaled
+from arrhythmia_records import (
+    CASES,
+    NORMAL,
+    QRS,
+    WIDE,
+    P,
+    T,
+    Waves,
+    draw,
+    matched,
+    record,
+    scaled,
+)
 
 from pipeline.registration.rhythm import read_rhythm
 from pipeline.registration.rpeaks import RPeakDetector, find_beats, with_end_held
@@ -87,6 +99,76 @@ def test_a_fast_heart_that_was_timed_by_its_t_waves_is_timed_by_r_again(rr_s, t_
     late_s = np.array([at_s for at_s, _ in beats if at_s > 12.0])
     assert (matched(found_s, late_s, 0.03) >= 0).all()
     assert (found_s > 11.9).sum() <= len(late_s) + 1
+
+
+@pytest.mark.parametrize("rr_s", [0.7, 0.9, 1.2])
+@pytest.mark.parametrize("t_share", [1.5, 2.2])
+def test_t_waves_larger_than_r_are_known_by_coming_after_every_beat(t_share, rr_s):
+    """Low QRS complexes with T waves of up to half their energy and more, told by their shape."""
+    rng = np.random.default_rng(5)
+    times_s = np.arange(60 * 360) / 360
+    tall = (*P, *scaled(QRS, 0.4), (0.26, 0.042, 0.4 * 1.1 * t_share, -0.4 * 0.8 * t_share))
+    r_times_s = 0.4 + np.cumsum(rr_s * (1 + 0.02 * rng.normal(size=int(59 / rr_s))))
+    early = {20, 33}
+    # An early beat of the ventricle is none of them, though it comes while T waves do.
+    beats = [(at_s, tall) for at_s in r_times_s]
+    beats += [(r_times_s[k] + 0.55 * rr_s, WIDE) for k in early]
+    signal = draw(rng, times_s, sorted(beats), noise_mv=0.01)
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    true_s = np.array(sorted(at_s for at_s, _ in beats))
+    true_s = true_s[(true_s > 8.0) & (true_s < 59.5)]
+    assert (matched(found_s, true_s, 0.1) >= 0).all()
+    assert ((found_s > 7.9) & (found_s < 59.6)).sum() <= len(true_s) + 1
+
+
+def test_late_t_waves_of_a_blocked_bundle_are_none_where_all_beats_are_wide():
+    rng = np.random.default_rng(5)
+    times_s = np.arange(60 * 360) / 360
+    wide = (*P, (-0.02, 0.022, 0.9, 0.0), (0.045, 0.024, 0.8, 0.0), (0.42, 0.05, -0.8, 0.0))
+    r_times_s = 0.4 + np.cumsum(0.8 * (1 + 0.02 * rng.normal(size=74)))
+    signal = draw(rng, times_s, [(at_s, wide) for at_s in r_times_s], noise_mv=0.01)[:, :1]
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    r_times_s = r_times_s[r_times_s < 59.5]
+    assert (matched(found_s, r_times_s, 0.1) >= 0).all()
+    assert len(found_s) <= len(r_times_s) + 1
+
+
+@pytest.mark.parametrize("noise_mv", [0.001, 0.002])
+def test_a_lead_that_dies_quietly_does_not_hide_the_beats_of_another(noise_mv):
+    """Its last noise lies within a step of the converter, so that nothing tells it from rest."""
+    rng = np.random.default_rng(7)
+    times_s, r_times_s = np.arange(60 * 360) / 360, 0.6 + np.arange(74) * 0.8
+    beats = [(at_s, (*P, *QRS, *T)) for at_s in r_times_s]
+    signal = draw(rng, times_s, beats, noise_mv=0.0)
+    signal += np.array([0.03, 0.006]) * rng.normal(size=signal.shape)
+    dead = (times_s > 25) & (times_s < 37)
+    signal[dead, 1] = signal[dead, 1][0] + noise_mv * rng.normal(size=dead.sum())
+    found_s = np.array([one.time_s for one in find_beats(np.round(signal / 0.005) * 0.005, 360.0)])
+    meanwhile_s = r_times_s[(r_times_s > 25) & (r_times_s < 37)]
+    # The first ones show that it is dead.
+    assert (matched(found_s, meanwhile_s) < 0).sum() <= 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_r_outdoes_p_even_where_p_was_taken_for_the_usual_beat(seed):
+    """Second-degree block: lone P waves before the first beats, and after every few."""
+    rng = np.random.default_rng(seed)
+    times_s = np.arange(90 * 360) / 360
+    p_wave, at_s, beats, r_times_s, blocked = ((0.0, 0.026, 0.4, 0.0),), 0.5, [], [], 3
+    qrs = ((0.0, 0.011, 1.3, 0.0), (0.026, 0.011, -0.3, 0.0), (0.28, 0.045, 0.2, 0.0))
+    while at_s < 89.5:
+        beats.append((at_s, p_wave))
+        if blocked > 0:
+            blocked -= 1
+        else:
+            beats.append((at_s + 0.16, qrs))
+            r_times_s.append(at_s + 0.16)
+            blocked = int(rng.random() < 0.4)
+        at_s += 0.68 * (1 + 0.02 * rng.normal())
+    signal = draw(rng, times_s, sorted(beats), noise_mv=0.015)[:, :1]
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    later_s = np.array([at_s for at_s in r_times_s if at_s > 12.0])
+    assert (matched(found_s, later_s, 0.05) >= 0).all()
 
 
 @pytest.mark.parametrize("rate_hz", [100, 250, 1000])

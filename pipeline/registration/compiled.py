@@ -11,7 +11,7 @@ from pipeline.compiled import door
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules", "qrs")
+_DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules", "leads", "qrs")
 _SOURCES = (*_DETECTOR, "ticks")
 
 

@@ -20,6 +20,8 @@ from pipeline.geometry import Float
 KEPT_INTERVALS, KEPT_WAVES, KEPT_FOUND = 8, 64, 64
 SHAPE_POINTS = 21
 """Places about R at which shapes are compared."""
+T_STEPS, T_STEP_S = 24, 0.02
+"""Times after a beat, so far apart, for which it is kept how often a T wave came then."""
 
 
 class Usual:
@@ -109,12 +111,20 @@ class Rhythm:
     last_likeness: float
     last_tall: float
     last_steep: float
+    last_sharp: float
     strange: int
     """Beats of another shape in succession."""
     outdone: bool
     """Whether a sharper wave followed the last beat too soon for a beat of its own."""
     outdone_before: int
     """For how many beats in succession, up to the one before that, this was so."""
+    t_wave: Annotated[Float, T_STEPS]
+    """How often, of late, a dull wave came so long after a beat."""
+    t_wave_now: Annotated[Float, T_STEPS]
+    """1 where one came after the last beat."""
+    t_height: float
+    """Energy that such waves have at most, on average."""
+    t_height_now: float
     intervals: int
     """RR intervals so far, of which the latest are kept."""
     interval: Annotated[Float, KEPT_INTERVALS]
@@ -141,6 +151,10 @@ class Now:
     tall: float
     """Height and steepness of the wave measured last, as shares of the usual beat's."""
     steep: float
+    sharp: float
+    """How much of its steepest change half the time takes: 0.5 where it is smooth, 1 for a step."""
+    after: bool
+    """Whether the wave measured last may be the T wave of the last beat."""
     towers: int
     """First beats that towered over the others."""
     waiting: int

@@ -13,7 +13,7 @@ With every sample, in this order:
    weighs a T wave as high as R with a sixth.
 3. ``_learn``: until beats are plain to see, levels of beats and of what lies between them are
    sought in all samples so far (``levels``); then all of these are gone through anew.
-4. ``_fuse``: leads add up, each in units of its own beats, weighted by how far those stand out of
+4. ``fuse``: leads add up, each in units of its own beats, weighted by how far those stand out of
    what lies between (inverse variance), so a lead that is lost or noisy has no say.
 5. ``_decide``: the highest sum that nothing exceeded for ``confirm`` samples is a wave. ``_judge``
    takes it for a beat if it is none of noise, T waves and P waves (``rules``). It may also show
@@ -30,6 +30,7 @@ from pipeline.geometry import Float
 from pipeline.registration.compiled import compiled
 from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
 from pipeline.registration.envelope import store
+from pipeline.registration.leads import SILENT_EVERY_S, fuse, refuse_knocks, refuse_silent
 from pipeline.registration.levels import (
     LEAST_NOISE,
     REFRACTORY_S,
@@ -37,7 +38,6 @@ from pipeline.registration.levels import (
     learn_level,
     wave_levels,
 )
-from pipeline.registration.quality import RUN_S, shows_nothing
 from pipeline.registration.rules import (
     LATE_T_WAVE_S,
     LONG_AHEAD_S,
@@ -47,8 +47,10 @@ from pipeline.registration.rules import (
     VERY_ALIKE,
     is_beat,
     is_sharper_than_last,
+    is_usual_t_wave,
     last_may_be_p_wave,
     learn_stature,
+    learn_t_wave,
     measure_stature,
     outdoes_last,
     resembles,
@@ -80,13 +82,7 @@ RECENT_S = 4.0
 FALL = 0.7
 """Levels fall no lower at once than to this share, unless a wave looks like the usual beat."""
 
-# What a single lead or wave may say.
-MOST_CONTRAST, MOST_ENERGY = 20.0, 2.0
-"""However clear a lead, it weighs no more than with the first ratio of beats to noise; and however
-high a wave, no lead says more than so many of its beats."""
-KNOCK, GAIN = 8.0, 1.3
-"""Energy, in units of a lead's beats, that no beat has: the lead was knocked. Its level grows by a
-factor each time: should beats have become so much larger, they count after some of them."""
+# What a single wave may say.
 MOST_BETWEEN = 0.6
 """Height that a wave between beats counts with at most."""
 
@@ -139,7 +135,7 @@ def _decide(i: int, plan: Plan, s: State) -> None:
     now = s.now[0]
     for k in range(len(s.leads)):
         follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
-    height = _fuse(i, plan, s)
+    height = fuse(i, plan, s)
     s.fused[i % plan.length] = height
     if height > now.best:
         now.best, now.best_at = height, i
@@ -154,36 +150,17 @@ def _decide(i: int, plan: Plan, s: State) -> None:
 
 
 @compiled
-def _fuse(i: int, plan: Plan, s: State) -> float:
-    """Weigh all leads by what they show now: their energy at sample ``i``, 1 for a usual beat."""
-    total, weights, now = 0.0, 0.0, s.now[0].seen
-    usable = False
-    for k in range(len(s.leads)):
-        lead, level = s.leads[k], s.leads[k].usual.level
-        off = lead.run >= RUN_S * plan.rate_hz or now < lead.bad_until
-        usable = usable or not shows_nothing(lead, now, plan.rate_hz)
-        lead.weight = 0.0
-        if off or level <= 0.0:
-            continue
-        contrast = min(level / lead.noise, MOST_CONTRAST)
-        lead.weight = contrast * contrast
-        weights += lead.weight
-        total += lead.weight * min(s.energy[k, i % plan.length] / level, MOST_ENERGY)
-    s.now[0].usable = usable
-    return total / weights if weights > 0.0 else 0.0
-
-
-@compiled
 def _judge(at: int, plan: Plan, s: State) -> None:
     """Take the wave at a sample for a beat or not."""
     rhythm = s.now[0].rhythm
     since_s = (at - rhythm.last_at) / plan.rate_hz
+    measure_stature(at, plan, s)
     doubted = since_s < LONG_AHEAD_S and last_may_be_p_wave(at, s)
     if since_s < SPLIT_S and not doubted:
         return
     # Leads that turned out to be lost since then no longer count.
-    _refuse_knocks(at, plan, s)
-    height = _fuse(at, plan, s)
+    refuse_knocks(at, plan, s)
+    height = fuse(at, plan, s)
     measure_stature(at, plan, s)
     instead = doubted and outdoes_last(since_s, height, s)
     anew = False
@@ -193,7 +170,9 @@ def _judge(at: int, plan: Plan, s: State) -> None:
     instead = instead or anew
     if instead:
         since_s = (at - s.now[0].before.last_at) / plan.rate_hz
-    if since_s < REFRACTORY_S:
+    s.now[0].after = False
+    usual_t_wave = not instead and is_usual_t_wave(since_s, height, plan, s)
+    if since_s < REFRACTORY_S or usual_t_wave:
         return
     if is_beat(since_s, height, False, plan, s) and resembles(at, since_s, height, False, plan, s):
         if instead:
@@ -225,26 +204,18 @@ def _keep(at: int, height: float, s: State) -> None:
 
 
 @compiled
-def _refuse_knocks(at: int, plan: Plan, s: State) -> None:
-    """Take the say from leads whose energy near a wave is beyond any beat's: they were knocked."""
-    for k in range(len(s.leads)):
-        lead, usual, most = s.leads[k], s.leads[k].usual, 0.0
-        for i in range(at - plan.confirm, at + plan.confirm + 1):
-            most = max(most, s.energy[k, i % plan.length])
-        if most > KNOCK * usual.level > 0.0:
-            lead.bad_until = max(lead.bad_until, s.now[0].seen + 1.0)
-            usual.level *= GAIN
-
-
-@compiled
 def _look_back(i: int, plan: Plan, s: State) -> None:
     """A beat is overdue: take the highest wave since the last one, or lower the levels."""
     now, rhythm, rate_hz = s.now[0], s.now[0].rhythm, plan.rate_hz
+    # Before some beats are known, one lead may have the levels of another's noise.
+    if rhythm.beats > KEPT_INTERVALS and i % max(1, int(SILENT_EVERY_S * rate_hz)) == 0:
+        refuse_silent(i, plan, s)
     best = _highest_kept(i, plan, s)
     if best >= 0:
         wave = s.waves[best]
         # Of a wave that is kept only the sum over all leads is known.
         measure_stature(wave.at, plan, s)
+        now.after = False
         since_s = (wave.at - rhythm.last_at) / rate_hz
         if resembles(wave.at, since_s, wave.height, True, plan, s):
             _accept(wave.at, wave.height, True, False, False, plan, s)
@@ -314,12 +285,15 @@ def _accept(
     it."""
     now, rhythm, wave = s.now[0], s.now[0].rhythm, s.found[s.now[0].found]
     anew = towers(height, s) or anew
+    if not now.after:
+        learn_t_wave(s)
     now.before = now.rhythm
     for lead in s.leads:
         lead.before = lead.usual
     _learn_interval(at, plan, s)
     rhythm.last_at, rhythm.last_height, rhythm.last_likeness = at, height, wave.likeness
     rhythm.last_tall, rhythm.last_steep = now.tall, now.steep
+    rhythm.last_sharp = now.sharp
     rhythm.outdone_before = rhythm.outdone_before + 1 if rhythm.outdone else 0
     rhythm.outdone = False
     if anew:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import Plan, State
+from pipeline.registration.detector_state import T_STEP_S, T_STEPS, Plan, State
 from pipeline.registration.waves import ALIKE, measure_beat, smooth_window
 
 # A beat at all: is it higher than noise?
@@ -27,12 +27,25 @@ LATE_T_WAVE_S = 0.45
 FADE_S, LARGE = 0.15, 1.6
 """Beats of another shape, or so large, are wide or have large T waves: after them what a wave needs
 falls to nothing in so long, not at once. No beat counts as larger for its T wave."""
+USUAL_WIDE = 0.36
+"""Where the usual beat rises by less than this share of its height in ``RISE_S``, it is wide."""
 T_ENERGY, SHARP_ENERGY = 0.5, 0.3
 """Shares of a beat's energy under which a wave in that time is its T wave; the second, if the wave
 is as steep as so low a beat would be, which T waves are not (after Pan and Tompkins)."""
 DULL = 0.9
 """A wave is dull whose steepness, as a share of the usual beat's, is under this share of its
 height's: atrial waves and T waves. Low beats stay steep."""
+T_DULL, T_USUAL, T_HIGHER = 0.7, 0.5, 1.5
+"""A wave in that time that is less steep for its height than the last beat by the first factor may
+be a T wave, however high. It is one where, of late, as large a share of beats as the second had one
+then, and theirs were no lower than by the third factor."""
+T_NEAR, T_FOLLOW = 4, 1 / 6
+"""Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
+what is known of their energy, follow."""
+SPIKE = 0.65
+"""Largest change in half of ``RISE_S``, as a share of that in all of it: half for what is as smooth
+as QRS complexes are, 0.6 for the narrowest, 0.7 and more for a pacemaker's spikes. What follows a
+spike and is dull beside it is a QRS complex."""
 
 # Not noise, and not of the atria?
 VERY_ALIKE = 0.9
@@ -64,6 +77,8 @@ LOW = 0.7
 OWN = 0.98
 """Correlation from which a low wave is the heart's own beat, if it came when one was due: a tug at
 the electrode may follow it. P waves come too soon, and are 0.90 to 0.98 like beats."""
+MUCH_TALLER, MUCH_STEEPER = 2.0, 2.5
+"""By these factors R outdoes P even where P was taken for the usual beat, and came when due."""
 
 SHARPER, OUTDONE = 1.5, 4
 """A wave that follows a beat within the refractory time, as high and sharper by the first factor,
@@ -112,8 +127,22 @@ def _exceeds(height: float, place: float, s: State) -> bool:
 @compiled
 def _t_wave_until_s(overdue: bool, plan: Plan, s: State) -> float:
     """Until when after the last beat a wave is its T wave."""
+    if overdue or _are_wide(s):
+        return LATE_T_WAVE_S
     slow = math.sqrt(max(s.now[0].rhythm.usual_rr / (USUAL_S * plan.rate_hz), 1.0))
-    return LATE_T_WAVE_S if overdue else min(T_WAVE_S * slow, LATE_T_WAVE_S)
+    return min(T_WAVE_S * slow, LATE_T_WAVE_S)
+
+
+@compiled
+def _are_wide(s: State) -> bool:
+    """Whether the usual beat is as wide as where a bundle branch is blocked: its T wave is late."""
+    ratio, weights = 0.0, 0.0
+    for k in range(len(s.leads)):
+        lead = s.leads[k]
+        if lead.weight > 0.0 and lead.usual.tall > 0.0:
+            ratio += lead.weight * lead.usual.steep / lead.usual.tall
+            weights += lead.weight
+    return ratio < USUAL_WIDE * weights
 
 
 @compiled
@@ -158,12 +187,48 @@ def _came_before(s: State) -> bool:
 
 
 @compiled
+def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool:
+    """Whether a wave is dull and comes when such waves have come after the beats before; its time
+    is noted."""
+    now, rhythm = s.now[0], s.now[0].rhythm
+    dull = now.steep * rhythm.last_tall < T_DULL * (rhythm.last_steep * now.tall)
+    lower = height < rhythm.last_height and rhythm.last_sharp < SPIKE
+    now.after = dull and lower and since_s < 0.9 * _t_wave_until_s(False, plan, s)
+    if not now.after:
+        return False
+    at = int(since_s / T_STEP_S)
+    for k in range(max(at - T_NEAR, 0), min(at + T_NEAR + 1, T_STEPS)):
+        rhythm.t_wave_now[k] = 1.0
+    rhythm.t_height_now = max(rhythm.t_height_now, height)
+    known = at < T_STEPS and rhythm.t_wave[at] > T_USUAL
+    return bool(known and height < T_HIGHER * rhythm.t_height)
+
+
+@compiled
+def learn_t_wave(s: State) -> None:
+    """A beat that is no T wave ends the time in which those of the last one come."""
+    rhythm = s.now[0].rhythm
+    for k in range(T_STEPS):
+        rhythm.t_wave[k] += T_FOLLOW * (rhythm.t_wave_now[k] - rhythm.t_wave[k])
+        rhythm.t_wave_now[k] = 0.0
+    if rhythm.t_height_now > 0.0:
+        rhythm.t_height += T_FOLLOW * (rhythm.t_height_now - rhythm.t_height)
+    rhythm.t_height_now = 0.0
+
+
+@compiled
 def last_may_be_p_wave(at: int, s: State) -> bool:
-    """Whether the last beat was low and did not, as the heart's own, come when one was due."""
+    """Whether the last beat was low and did not, as the heart's own, come when one was due; or the
+    wave that was measured last is a beat beside which it is none."""
     rhythm, before = s.now[0].rhythm, s.now[0].before
+    if rhythm.beats < 2 or rhythm.last_height >= LOW:
+        return False
+    now = s.now[0]
+    if now.tall > MUCH_TALLER * rhythm.last_tall and now.steep > MUCH_STEEPER * rhythm.last_steep:
+        return True
     due = before.last_at + before.usual_rr
     own = rhythm.last_likeness >= OWN and abs(rhythm.last_at - due) < abs(at - due)
-    return rhythm.beats > 1 and rhythm.last_height < LOW and not own
+    return not own
 
 
 @compiled
@@ -195,18 +260,21 @@ def towers(height: float, s: State) -> bool:
 def measure_stature(at: int, plan: Plan, s: State) -> None:
     """How tall and steep the wave at a sample is, in shares of the usual beat's; 1 if unknown."""
     tall, steep, weights = 0.0, 0.0, 0.0
+    sharp, seen = 0.0, 0.0
     for k in range(len(s.leads)):
         lead = s.leads[k]
         weight, here, usual = lead.weight, lead.here, lead.usual
         if weight <= 0.0:
             continue
-        _measure(k, at, plan, s)
+        sharp += weight * _measure(k, at, plan, s)
+        seen += weight
         if usual.tall > 0.0 and usual.steep > 0.0:
             tall += weight * here.tall / usual.tall
             steep += weight * here.steep / usual.steep
             weights += weight
     s.now[0].tall = tall / weights if weights > 0.0 else 1.0
     s.now[0].steep = steep / weights if weights > 0.0 else 1.0
+    s.now[0].sharp = sharp / seen if seen > 0.0 else 0.0
 
 
 @compiled
@@ -223,11 +291,18 @@ def learn_stature(first: int, last: int, plan: Plan, s: State) -> None:
 
 
 @compiled
-def _measure(k: int, at: int, plan: Plan, s: State) -> None:
-    """Height and steepness of one lead about a sample, in its own units."""
+def _measure(k: int, at: int, plan: Plan, s: State) -> float:
+    """Height and steepness of one lead about a sample, in its own units; and how sharp it is: its
+    largest change in half a rise as a share of that in a whole one."""
     here = s.leads[k].here
     span, rise = int(SPAN_S * plan.rate_hz), max(1, round(RISE_S * plan.rate_hz))
+    half = max(1, int(0.5 * RISE_S * plan.rate_hz))
     window = smooth_window(s.raw[k], plan.length, at, span, span, s.fine)
     here.tall, here.steep = window.max() - window.min(), 0.0
     for i in range(rise, len(window)):
         here.steep = max(here.steep, abs(window[i] - window[i - rise]))
+    quick, slow = 0.0, 1e-300
+    for i in range(2 * half, len(window)):
+        quick = max(quick, abs(window[i] - window[i - half]))
+        slow = max(slow, abs(window[i] - window[i - 2 * half]))
+    return quick / slow
