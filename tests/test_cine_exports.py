@@ -385,11 +385,59 @@ def test_one_rr_interval_for_all_serves_prospective_triggering(tmp_path: Path) -
     np.testing.assert_allclose(cine.phases, 150 * np.arange(PHASES) / 900)
 
 
-def test_images_in_real_time_do_not_go_before_a_cine_for_their_number(tmp_path: Path) -> None:
+@pytest.mark.parametrize("untold", [False, True])
+@pytest.mark.parametrize("slices", [range(SLICES), range(1, SLICES + 2)])
+def test_images_in_real_time_do_not_go_before_a_cine_for_their_number(
+    tmp_path: Path, slices: range, untold: bool
+) -> None:
     """Their times run through many beats."""
-    beats = coarser(series([*range(SLICES)], [50.0 * k for k in range(4 * PHASES)]))
+    beats = coarser(series([*slices], [200.0 * k for k in range(4 * PHASES)]))
+    if untold:
+        for data in beats:
+            del data.NominalInterval
     folder = beside_the_stack(tmp_path, beats)
     stack = read_dicom_cine(folder)
     assert_is_the_stack(stack)
     assert 'series 9 "other"' in stack.left_out[0]
-    assert "slices that the stack has already" in stack.left_out[0]
+    assert "many beats in real time, no cine" in stack.left_out[0]
+
+
+def test_a_slice_that_runs_over_its_beat_does_not_make_a_cine_real_time(tmp_path: Path) -> None:
+    scout = coarser(series([*range(SLICES)], [100.0, 400.0]))
+    folder = beside_the_stack(tmp_path, scout)
+
+    def late(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "short axis")
+        if (number, phase) == (2, PHASES - 1):
+            data.TriggerTime = 812
+        return True
+
+    write_dicom(folder, late)
+    # What is refused is the cine, for that image: a smaller set does not take its place.
+    with pytest.raises(InputError, match=r"812 ms do not fit in an .* of 800 ms \(slice 2\)"):
+        read_dicom_cine(folder)
+
+
+@pytest.mark.parametrize("uids", ["one", "each"])
+def test_series_are_told_apart_by_number_where_their_uids_are_lost(
+    tmp_path: Path, uids: str
+) -> None:
+    """Late enhancement of the stack's slices is no further phase of them."""
+    enhancement = series([*range(SLICES)], [650.0])
+    folder = beside_the_stack(tmp_path, enhancement)
+    for k, path in enumerate(sorted(folder.glob("*.dcm"))):
+        data = dcmread(path)
+        data.SeriesInstanceUID = "1.2.3" if uids == "one" else f"1.2.3.{k + 1}"
+        data.save_as(path)
+    stack = read_dicom_cine(folder)
+    assert_is_the_stack(stack)
+    assert "one moment of the beat, no cine" in stack.left_out[0]
+
+
+def test_slices_of_two_examinations_are_told(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.StudyInstanceUID = "1.2.1" if number < SLICES - 1 else "1.2.2"
+        return True
+
+    write_dicom(tmp_path, change)
+    assert "different StudyInstanceUIDs" in read_dicom_cine(tmp_path).remarks[0]

@@ -7,17 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cine_files import (
+    ALL_FRAMES,
     PHASES,
     RR_MS,
+    SLICES,
     assert_is_the_stack,
     dicom_frame,
+    enhanced_object,
     in_series,
+    pixel_value,
     read_dicom_cine,
     write_dicom,
 )
 from pydicom.dataset import FileDataset
 
 from pipeline.errors import InputError
+from pipeline.imaging.dicom import read_dicom_study
 
 
 def without_times(data: FileDataset, number: int, phase: int) -> bool:
@@ -73,3 +78,79 @@ def test_images_of_neither_time_nor_number_are_refused(tmp_path: Path, number: i
     write_dicom(tmp_path, change)
     with pytest.raises(InputError, match="has no trigger time"):
         read_dicom_cine(tmp_path, RR_MS)
+
+
+@pytest.mark.parametrize("how", ["twice", "uid a file", "uid a phase"])
+def test_copies_and_uids_do_not_hinder_the_order(tmp_path: Path, how: str) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        without_times(data, number, phase)
+        if how == "uid a file":
+            data.SeriesInstanceUID = f"1.2.{data.InstanceNumber}"
+        if how == "uid a phase":
+            data.SeriesInstanceUID = f"1.2.{phase + 1}"
+        return True
+
+    write_dicom(tmp_path / "cine", change)
+    if how == "twice":
+        write_dicom(tmp_path / "cine" / "again", change)
+    assert_is_the_stack(read_dicom_cine(tmp_path / "cine", RR_MS))
+
+
+@pytest.mark.parametrize("objects", [1, SLICES, PHASES])
+def test_frames_of_enhanced_objects_are_taken_in_their_order(tmp_path: Path, objects: int) -> None:
+    for k in range(objects):
+        part = [
+            (number, phase)
+            for number, phase in ALL_FRAMES
+            if objects == 1 or k == (number if objects == SLICES else phase)
+        ]
+        data = enhanced_object(part)
+        data.InstanceNumber = k + 1
+        for frame in data.PerFrameFunctionalGroupsSequence:
+            del frame.CardiacSynchronizationSequence
+        data.save_as(tmp_path / f"{k}.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))
+
+
+def real_time(count: int, across: bool = False) -> list[FileDataset]:
+    found = []
+    for number in range(SLICES):
+        for k in range(count):
+            data = in_series(dicom_frame(number, 0), 9, "real time")
+            del data.TriggerTime
+            data.InstanceNumber = 1 + number * count + k
+            data.PixelSpacing = [3, 3]
+            data.PixelData = (3 * pixel_value(k, number)).tobytes()
+            if across:
+                data.ImageOrientationPatient = [0, 1, 0, 0, 0, -1]
+            found.append(data)
+    return found
+
+
+def test_of_two_untimed_stacks_of_one_direction_none_is_taken_for_its_number(
+    tmp_path: Path,
+) -> None:
+    write_dicom(tmp_path, without_times)
+    for k, data in enumerate(real_time(4 * PHASES)):
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    with pytest.raises(
+        InputError, match=r"do not tell when.*with 20; one may be in real time.*leave_out_series"
+    ):
+        read_dicom_cine(tmp_path, RR_MS)
+    stack, _ = read_dicom_study(tmp_path, RR_MS, without_series=[9])
+    assert_is_the_stack(stack)
+
+
+@pytest.mark.parametrize(("count", "views"), [(PHASES, 1), (4 * PHASES, 0), (2, 0)])
+def test_what_lies_across_is_spread_where_it_has_as_many_images(
+    tmp_path: Path, count: int, views: int
+) -> None:
+    """A cine has; perfusion, maps and localisers do not."""
+    write_dicom(tmp_path, without_times)
+    for data in real_time(count, across=True)[:count]:
+        data.save_as(tmp_path / f"other_{data.InstanceNumber}.dcm")
+    stack, found = read_dicom_study(tmp_path, RR_MS)
+    assert_is_the_stack(stack)
+    assert len(found) == views
+    assert ('series 9 "real time"' in stack.remarks[0]) == bool(views)
+    assert (stack.left_out[-1].endswith("it has no trigger times")) == (not views)

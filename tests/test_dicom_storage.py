@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
 from cine_files import assert_is_the_stack, pixel_value, read_dicom_cine, write_dicom
 from pydicom import dcmread, dcmwrite
+from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset, FileDataset
 
 from pipeline.errors import InputError
@@ -101,6 +103,26 @@ def test_objects_without_preamble_and_meta_information_are_read(
             enforce_file_format=False,
         )
         return False
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+@pytest.mark.parametrize("value", [[4095, 4095], "none"])
+def test_padding_that_is_no_single_number_is_no_padding(tmp_path: Path, value: Any) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        element = "IS" if value == "none" else "US"
+        data.add(DataElement(0x00280120, element, None if value == "none" else value))
+        return True
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+def test_bright_places_within_an_image_are_no_padding(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.PixelPaddingValue = int(pixel_value(phase, number)[2, 3])
+        return True
 
     write_dicom(tmp_path, change)
     assert_is_the_stack(read_dicom_cine(tmp_path))

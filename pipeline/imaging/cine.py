@@ -143,13 +143,18 @@ def _unlike(frames: Sequence[Frame], name: str) -> str:
 
 
 def _doubts_of_place(frames: Sequence[Frame]) -> tuple[str, ...]:
-    places = _unlike(frames, "frame_of_reference")
-    if not places:
-        return ()
-    return (
-        f"{places} have different FrameOfReferenceUIDs: if the patient was moved between them, "
-        "slices do not fit one another",
-    )
+    doubts = []
+    if places := _unlike(frames, "frame_of_reference"):
+        doubts.append(
+            f"{places} have different FrameOfReferenceUIDs: if the patient was moved between them, "
+            "slices do not fit one another"
+        )
+    if studies := _unlike(frames, "study"):
+        doubts.append(
+            f"{studies} have different StudyInstanceUIDs: if they are of two examinations, slices "
+            "do not fit one another"
+        )
+    return tuple(doubts)
 
 
 def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:

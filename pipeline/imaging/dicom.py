@@ -31,6 +31,9 @@ MR_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
     "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
 }
+MOST_FRAMES = 10**6
+"""No object holds more."""
+
 TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 """The same moment in classic and in Enhanced objects."""
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
@@ -95,15 +98,26 @@ def read_dicom_study(
     if not frames:
         found = "; ".join(left_out_lines(others, str(folder)))
         raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
+    frames = _with_series_told_apart(frames)
     source, remark = None, ""
     if rr_ms is not None:
         source = "study.yaml"
-        frames, remark = spread_evenly(frames, rr_ms)
+        frames, remark = spread_evenly(frames, rr_ms, str(folder))
     stack = stack_frames(frames, str(folder), source, others, fill)
     if remark:
         stack = replace(stack, remarks=(remark, *stack.remarks))
     views, no_views = long_axis_views(frames, stack.cine)
     return replace(stack, left_out=(*stack.left_out, *no_views)), views
+
+
+def _with_series_told_apart(frames: Sequence[Frame]) -> list[Frame]:
+    """Series as their number and description tell them, too: programs that make files anonymous may
+    give all series one UID, or each file a UID of its own."""
+    one_each = len({frame.series_uid for frame in frames}) > 0.5 * len(frames)
+    return [
+        replace(frame, series_uid=f"{'' if one_each else frame.series_uid} {frame.series}")
+        for frame in frames
+    ]
 
 
 def _require_series(asked: Sequence[int], there: set[int | None], where: str) -> None:
@@ -177,7 +191,7 @@ def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:
         )
     shared = (dataset.get("SharedFunctionalGroupsSequence") or [pydicom.Dataset()])[0]
     return [
-        _frame(f"{path} frame {k + 1}", pixels[k], dataset, _groups(shared, own), rr_ms)
+        _frame(f"{path} frame {k + 1}", pixels[k], dataset, _groups(shared, own), rr_ms, k)
         for k, own in enumerate(own_groups)
     ]
 
@@ -200,11 +214,13 @@ def _groups(shared: Any, own: Any) -> Groups:
     return with_converted
 
 
-def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None) -> Frame:
-    place = group("PlanePositionSequence").get("ImagePositionPatient")
+def _frame(
+    where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | None, place: int = 0
+) -> Frame:
+    corner = group("PlanePositionSequence").get("ImagePositionPatient")
     axes = group("PlaneOrientationSequence").get("ImageOrientationPatient")
     spacing = group("PixelMeasuresSequence").get("PixelSpacing")
-    if not place or not axes or not spacing:
+    if not corner or not axes or not spacing:
         raise InputError(
             f"{where}: has no ImagePositionPatient, ImageOrientationPatient or PixelSpacing; "
             "export the original images, not screen captures"
@@ -212,7 +228,7 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
     try:
         timing = group("CardiacSynchronizationSequence")
         own_rr_ms = _rr_ms(timing, dataset) if rr_ms is None else rr_ms
-        position_mm, directions, spacing_mm = _geometry(place, axes, spacing)
+        position_mm, directions, spacing_mm = _geometry(corner, axes, spacing)
         return Frame(
             where=where,
             pixels=rescaled(pixels, group("PixelValueTransformationSequence")),
@@ -226,7 +242,8 @@ def _frame(where: str, pixels: Any, dataset: Any, group: Groups, rr_ms: float | 
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
             frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
             patient=str(dataset.get("PatientID", "") or "").strip(),
-            number=_whole(dataset.get("InstanceNumber")),
+            number=_number(dataset, group, place),
+            study=str(dataset.get("StudyInstanceUID", "") or ""),
         )
     except (ValueError, TypeError, IndexError) as error:
         raise _not_understood(where, error) from error
@@ -297,14 +314,23 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
 
 def _series_number(dataset: Any) -> int | None:
     """None where the file does not tell, or tells no number: it is a label, no more."""
-    try:
-        return _whole(dataset.get("SeriesNumber"))
-    except (ValueError, TypeError):
-        return None
+    return _whole(dataset.get("SeriesNumber"))
+
+
+def _number(dataset: Any, group: Groups, place: int) -> int | None:
+    """The image's number, of frames of one object their order in it or in time behind that."""
+    number = _whole(dataset.get("InstanceNumber"))
+    if "PerFrameFunctionalGroupsSequence" not in dataset:
+        return number
+    in_time = _whole(group("FrameContentSequence").get("TemporalPositionIndex"))
+    return MOST_FRAMES * (number or 0) + (place if in_time is None else in_time)
 
 
 def _whole(number: Any) -> int | None:
-    return None if number in (None, "") else int(number)
+    try:
+        return None if number in (None, "") else int(number)
+    except (ValueError, TypeError):
+        return None
 
 
 def _series_name(dataset: Any) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pydicom
+from scipy.ndimage import label
 
 from pipeline.errors import InputError
 from pipeline.imaging.limits import MOST_PIXELS, require_bounded
@@ -62,25 +63,43 @@ def _read_by_gdcm(dataset: Any, path: Path) -> Any:
 
 
 def without_padding(stored: Any, dataset: Any) -> Any:
-    """Stored values; those that only pad the image are as dark as its darkest place.
+    """Stored values ``(frame, row, column)``; those that pad images are as dark as the darkest.
 
     DICOM PS3.3 C.7.5.1.1.2: a PixelPaddingValue, or the range from it to PixelPaddingRangeLimit,
-    is no measurement.
+    is no measurement. It pads what lies outside: saturated blood may have the same value.
     """
-    if dataset.get("PixelPaddingValue") in (None, ""):
+    first, limit = (
+        _one_number(dataset.get(name)) for name in ("PixelPaddingValue", "PixelPaddingRangeLimit")
+    )
+    if first is None:
         return stored
-    first = int(dataset.PixelPaddingValue)
-    limit = dataset.get("PixelPaddingRangeLimit")
-    last = first if limit in (None, "") else int(limit)
+    low, high = sorted((first, first if limit is None else limit))
     # A header may give the unsigned number of a value that is signed, or the other way round.
     bits = 2 ** int(dataset.BitsAllocated)
     padding = np.zeros(stored.shape, bool)
     for turn in (-bits, 0, bits):
-        padding |= (stored >= min(first, last) + turn) & (stored <= max(first, last) + turn)
+        padding |= (stored >= low + turn) & (stored <= high + turn)
+    if padding.any():
+        padding = np.stack([_at_the_edge(one) for one in padding])
     if not padding.any() or padding.all():
         return stored
     dark = stored[~padding].max() if _is_white_for_black(dataset) else stored[~padding].min()
     return np.where(padding, dark, stored)
+
+
+def _one_number(value: Any) -> int | None:
+    """None where a header does not tell it, or does not tell one whole number."""
+    try:
+        return None if value in (None, "") else int(value)
+    except (ValueError, TypeError):
+        return None
+
+
+def _at_the_edge(mask: Any) -> Any:
+    """The parts of a mask ``(row, column)`` that touch the edge of the image."""
+    parts, _ = label(mask)
+    edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    return np.isin(parts, edge[edge > 0])
 
 
 def _is_white_for_black(dataset: Any) -> bool:

@@ -30,6 +30,10 @@ LEAST_OF_A_BEAT = 0.1
 """From the first phase of a cine to the last; end-diastole and end-systole are a quarter apart."""
 USUAL_RR_MS = 900.0
 """Of a person at rest, where nothing tells."""
+LONGEST_RR_MS = 3000.0
+"""Where nothing tells the RR interval, what takes longer is no heartbeat."""
+MANY_BEATS = 1.5
+"""Times beyond so many RR intervals are of more than one beat, not of one that was long."""
 
 LEAVE_OUT = "take the other's files out, or name its number in cine.leave_out_series in study.yaml"
 
@@ -77,6 +81,9 @@ class Frame:
 
     patient: str = ""
     """The patient's identifier; empty when the file does not tell."""
+
+    study: str = ""
+    """What tells apart a patient's examinations; empty when the file does not."""
 
     number: int | None = None
     """Its number within its series; None when the file does not tell."""
@@ -187,7 +194,8 @@ def _same_axes(first: Frame, frame: Frame) -> bool:
     return float((first.axes * frame.axes).sum(axis=1).min()) > PARALLEL_COSINE
 
 
-def _parallel(first: Frame, frame: Frame) -> bool:
+def are_parallel(first: Frame, frame: Frame) -> bool:
+    """Whether two images lie in one direction, as slices of a stack do."""
     return abs(float(first.normal @ frame.normal)) > PARALLEL_COSINE
 
 
@@ -221,12 +229,16 @@ def _spans_beat(frames: Sequence[Frame]) -> bool:
 
 
 def _in_one_beat(frames: Sequence[Frame]) -> bool:
-    """Whether times lie within the RR interval, as those of images in real time do not."""
-    return all(
-        frame.rr_ms is None or time_ms < frame.rr_ms
-        for frame in frames
-        for time_ms in list(frame.times_ms.values())[:1]
-    )
+    """Whether most slices' times lie within about one RR interval, as those of images in real time
+    do not."""
+    beats = [max(map(_beats, one)) for one in by_slice(frames)]
+    return float(np.median(beats)) < MANY_BEATS
+
+
+def _beats(frame: Frame) -> float:
+    """In which heartbeat an image was taken, counted from 0."""
+    time_ms = next(iter(frame.times_ms.values()), 0.0)
+    return time_ms / (frame.rr_ms or LONGEST_RR_MS / MANY_BEATS)
 
 
 def _time_range_ms(frames: Sequence[Frame]) -> tuple[float, float]:
@@ -251,7 +263,7 @@ def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame], folder: str) 
         f"which was taken for its {len(stack)} images: if that is not the short axis, take its "
         "files out, or name its number in cine.leave_out_series in study.yaml"
         for one in others
-        if not _parallel(stack[0], one[0])
+        if not are_parallel(stack[0], one[0])
     )
 
 
@@ -260,7 +272,7 @@ def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
     stacks = [one for one in sets if is_stack(one) and one[0].kind in (ORIGINAL, DERIVED)]
     ranked = []
     for one in sets:
-        along = [_weight(other) for other in stacks if _parallel(one[0], other[0])]
+        along = [_weight(other) for other in stacks if are_parallel(one[0], other[0])]
         per_mm2 = 1 / (one[0].spacing_mm[0] * one[0].spacing_mm[1])
         enough = any(one is other for other in stacks)
         original = one[0].kind == ORIGINAL
@@ -277,7 +289,7 @@ def _weight(frames: Sequence[Frame]) -> int:
 def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str) -> None:
     rank, (first, *_) = ranked[0]
     for other_rank, (other, *_) in ranked[1:]:
-        if rank[0] and other_rank[:5] == rank[:5] and not _parallel(first, other):
+        if rank[0] and other_rank[:5] == rank[:5] and not are_parallel(first, other):
             raise InputError(
                 f"{where}: holds two stacks of {rank[4]} images in different directions, "
                 f"{first.series} ({first.where}) and {other.series} ({other.where}); "
@@ -343,13 +355,15 @@ def _covered(frames: Iterable[Frame], normal: Float, slices_mm: Float) -> bool:
 
 def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> str | None:
     other = others[0]
-    if not _parallel(first, other):
+    if not are_parallel(first, other):
         angle = np.degrees(np.arccos(min(abs(float(first.normal @ other.normal)), 1.0)))
         return f"not parallel to the stack, turned by {angle:.0f} degrees"
     if max(_moments(others)) < MIN_PHASES:
         return "one moment a slice, no cine"
     if not _spans_beat(others):
         return "all at nearly one moment of the beat, no cine"
+    if not _in_one_beat(others):
+        return "many beats in real time, no cine"
     if not _covered(others, first.normal, slices_mm):
         return None
     rows, columns = other.pixels.shape

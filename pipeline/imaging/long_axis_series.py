@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.geometry import Float
 from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, placement
 from pipeline.imaging.frames import (
+    LEAST_OF_A_BEAT,
     MIN_PHASES,
     NEAREST_SLICES_MM,
     ORIGINAL,
@@ -49,14 +50,17 @@ def long_axis_views(
     frames = list(frames)
     normal = np.cross(stack.mr_from_index[:3, 0], stack.mr_from_index[:3, 1])
     normal /= np.linalg.norm(normal)
-    reference = _reference(frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE)
+    along = [frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE]
+    reference = _most(frame.frame_of_reference for frame in along)
+    examination = _most(frame.study for frame in along)
     slices: list[list[Frame]] = []
     elsewhere: list[Frame] = []
     for frame in sorted(frames, key=lambda one: one.where):
         across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
         if not across or frame.kind != ORIGINAL:
             continue
-        if frame.frame_of_reference not in ("", reference):
+        told = frame.frame_of_reference
+        if told not in ("", reference) or (not told and frame.study not in ("", examination)):
             elsewhere.append(frame)
             continue
         of_its_slice = next((one for one in slices if _same_slice(one[0], frame)), None)
@@ -69,7 +73,8 @@ def long_axis_views(
     reasons = [reason for _, some in found for reason in some]
     reasons += [
         f"{one[0].series}: no long-axis view: it has another FrameOfReferenceUID than the stack, "
-        "as of a patient laid down anew"
+        "or none and another StudyInstanceUID, as of a patient laid down anew; if a program that "
+        "makes files anonymous did that, let it keep one for all"
         for one in _by_series(elsewhere)
         if len(one) >= MIN_PHASES
     ]
@@ -80,8 +85,8 @@ def _cosine(frame: Frame, normal: Float) -> float:
     return abs(float(frame.normal @ normal))
 
 
-def _reference(frames: Iterable[Frame]) -> str:
-    counted = Counter(frame.frame_of_reference for frame in frames)
+def _most(uids: Iterable[str]) -> str:
+    counted = Counter(uids)
     return max(counted, key=lambda uid: (counted[uid], uid), default="")
 
 
@@ -153,6 +158,8 @@ def _view(frames: Sequence[Frame]) -> LongAxis | str | None:
             f"its trigger times, from {times_ms[0]:g} to {times_ms[-1]:g} ms, do not fit in its RR "
             f"interval of {rr_ms:g} ms"
         )
+    if times_ms[-1] - times_ms[0] < LEAST_OF_A_BEAT * rr_ms:
+        return f"all at nearly one moment of the beat, {times_ms[0]:g} to {times_ms[-1]:g} ms"
     intensity = np.stack([np.asarray(frame.pixels, np.float32) for frame in ordered])[:, None]
     place = placement(first, first.normal)
     return LongAxis(first.series, Cine(intensity, place, np.array(times_ms) / rr_ms, rr_ms / 1000))

@@ -2,58 +2,133 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from pipeline.imaging.frames import ORIGINAL, Frame, by_slice, is_stack, sets_alike
+import numpy as np
+
+from pipeline.errors import InputError
+from pipeline.imaging.frames import (
+    LEAVE_OUT,
+    MIN_PHASES,
+    ORIGINAL,
+    Frame,
+    are_parallel,
+    by_slice,
+    is_stack,
+    sets_alike,
+)
 
 ORDER = "InstanceNumber"
+ALIKE_COUNT = 1.25
+"""A series across the stack is a cine as the stack is if its slices have as many images, but for
+this factor; perfusion, maps and localisers have more or fewer."""
 
 
-def spread_evenly(frames: Sequence[Frame], rr_ms: float) -> tuple[list[Frame], str]:
+def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[list[Frame], str]:
     """Images with the times of a regular beat where their own tell none, and a remark on it.
 
     Each series' images of a slice are spread over the RR interval in the order of their
-    InstanceNumber, which scanners count in the order of time within a slice. Nothing is changed,
-    and the remark is empty, where the times tell of a cine, or no images of a cine are untimed.
+    InstanceNumber, which scanners count in the order of time within a slice. So it is with a stack
+    to which none is parallel that has times, and with what lies across it and has about as many
+    images a slice. The remark is empty where there is no such stack.
 
     Parameters
     ----------
     rr_ms
         RR interval that a person has given.
+
+    Raises
+    ------
+    InputError
+        When there are two such stacks of one direction: one of them may be many beats in real time.
     """
-    if any(is_stack(one) for one in sets_alike(frames) if one[0].kind == ORIGINAL):
-        return list(frames), ""
-    timed = {
-        id(frame): {ORDER: place * rr_ms / len(one)}
-        for alike in sets_alike(frames)
-        for one in _of_slice_and_series(alike)
-        for place, frame in enumerate(_in_order(one))
-    }
-    spread = [
-        replace(frame, times_ms=timed[id(frame)]) if id(frame) in timed else frame
+    frames = list(frames)
+    timed = [one for one in sets_alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
+    spread: dict[int, Frame] = {}
+    stacks: list[list[Frame]] = []
+    others: list[list[Frame]] = []
+    for alike in sets_alike(frames):
+        found = _spread(alike, rr_ms)
+        if any(are_parallel(alike[0], one[0]) for one in timed) or not found:
+            continue
+        even = [found.get(id(frame), frame) for frame in alike]
+        if alike[0].kind == ORIGINAL and is_stack(even):
+            stacks.append(alike)
+            spread |= found
+        else:
+            others.append(alike)
+    _require_one_a_direction(stacks, where)
+    if not stacks:
+        return frames, ""
+    count = max(_images_a_slice(one) for one in stacks)
+    for alike in others:
+        spread |= _spread(alike, rr_ms, count)
+    views = {
+        frame.series
         for frame in frames
-    ]
-    if not any(is_stack(one) for one in sets_alike(spread)):
-        return list(frames), ""
-    return spread, (
-        "the files do not tell when in the heartbeat images were taken: each slice's are taken in "
-        "the order of their InstanceNumber, evenly over the RR interval of cine.rr_ms"
+        if id(frame) in spread and not any(are_parallel(frame, one[0]) for one in stacks)
+    }
+    also = f" (in {', '.join(sorted(views))}, across it, too)" if views else ""
+    return [spread.get(id(frame), frame) for frame in frames], (
+        f"the files do not tell when in the heartbeat images were taken: the {count:g} of each "
+        f"slice are taken in the order of their InstanceNumber, evenly over the RR interval of "
+        f"cine.rr_ms{also}; of a heart seen in real time that would be wrong"
     )
 
 
+def _require_one_a_direction(stacks: Sequence[Sequence[Frame]], where: str) -> None:
+    for number, one in enumerate(stacks):
+        for other in stacks[:number]:
+            if are_parallel(one[0], other[0]):
+                raise InputError(
+                    f"{where}: holds two cine stacks of one direction that do not tell when their "
+                    f"images were taken, {other[0].series} ({other[0].where}) with "
+                    f"{_images_a_slice(other):g} images a slice and {one[0].series} "
+                    f"({one[0].where}) with {_images_a_slice(one):g}; one may be in real time: "
+                    f"keep the one to be used: {LEAVE_OUT}"
+                )
+
+
+def _images_a_slice(frames: Sequence[Frame]) -> float:
+    return float(np.median([len({frame.number for frame in one}) for one in by_slice(frames)]))
+
+
+def _spread(alike: Sequence[Frame], rr_ms: float, count: float | None = None) -> dict[int, Frame]:
+    """Images alike, by identity, with even times; those of slices with another count left out."""
+    found: dict[int, Frame] = {}
+    for one in _of_slice_and_series(alike):
+        ordered = _in_order(one)
+        if count and not 1 / ALIKE_COUNT <= len(ordered) / count <= ALIKE_COUNT:
+            continue
+        for place, same in enumerate(ordered):
+            time_ms = place * rr_ms / len(ordered)
+            found |= {id(frame): replace(frame, times_ms={ORDER: time_ms}) for frame in same}
+    return found
+
+
 def _of_slice_and_series(alike: Sequence[Frame]) -> list[list[Frame]]:
+    """Parts of images alike, of one slice and series each; whole slices where no series shows a
+    slice more than once."""
+    slices = by_slice(alike)
     parts: dict[tuple[int, str], list[Frame]] = {}
-    for number, one in enumerate(by_slice(alike)):
+    for number, one in enumerate(slices):
         for frame in one:
             parts.setdefault((number, frame.series_uid), []).append(frame)
-    return list(parts.values())
+    single = max(map(len, parts.values())) == 1
+    return slices if single else list(parts.values())
 
 
-def _in_order(frames: Sequence[Frame]) -> list[Frame]:
-    """Images by number; none where times or numbers do not leave that open and tell it."""
-    times = {tuple(frame.times_ms.values()) for frame in frames}
-    numbers = {frame.number for frame in frames if frame.number is not None}
-    if len(frames) < 2 or len(times) > 1 or len(numbers) < len(frames):
+def _in_order(frames: Iterable[Frame]) -> list[list[Frame]]:
+    """Images by number, copies together; none where times or numbers do not leave that open and
+    tell it."""
+    by_number: dict[int | None, list[Frame]] = {}
+    for frame in frames:
+        by_number.setdefault(frame.number, []).append(frame)
+    times = {tuple(frame.times_ms.values()) for one in by_number.values() for frame in one}
+    copies = all(
+        np.array_equal(frame.pixels, one[0].pixels) for one in by_number.values() for frame in one
+    )
+    if len(by_number) < MIN_PHASES or len(times) > 1 or None in by_number or not copies:
         return []
-    return sorted(frames, key=lambda frame: frame.number or 0)
+    return [one for _, one in sorted(by_number.items(), key=lambda item: item[0] or 0)]
