@@ -257,6 +257,14 @@ def placed(path: Path, sform: int, qform: int, apart_mm: float = 0.0) -> tuple[s
     return read_nifti_cine(path / "placed.nii.gz", None).remarks
 
 
+def test_a_map_of_labels_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "cine_gt.nii"
+    labels = np.random.default_rng(1).integers(0, 4, (40, 40, 5, 5)).astype(np.uint8)
+    nibabel.save(nibabel.Nifti1Image(labels, np.diag([1, 1, 8, 1])), path)
+    (remark,) = read_nifti_cine(path, None, 800).remarks
+    assert remark == "its voxels hold 0, 1, 2, 3 alone, as a map of labels does: is it the cine?"
+
+
 def test_voxels_that_lost_their_size_are_told(tmp_path: Path) -> None:
     path = tmp_path / "cine.nii"
     nifti_cine(path, np.eye(4))

@@ -96,6 +96,15 @@ def test_copies_and_uids_do_not_hinder_the_order(tmp_path: Path, how: str) -> No
     assert_is_the_stack(read_dicom_cine(tmp_path / "cine", RR_MS))
 
 
+def test_the_same_images_as_classic_and_enhanced_objects_are_one_beat(tmp_path: Path) -> None:
+    write_dicom(tmp_path, without_times)
+    data = in_series(enhanced_object(ALL_FRAMES), 1, "short axis")
+    for frame in data.PerFrameFunctionalGroupsSequence:
+        del frame.CardiacSynchronizationSequence
+    data.save_as(tmp_path / "enhanced.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))
+
+
 @pytest.mark.parametrize("objects", [1, SLICES, PHASES])
 def test_frames_of_enhanced_objects_are_taken_in_their_order(tmp_path: Path, objects: int) -> None:
     for k in range(objects):

@@ -18,12 +18,15 @@ OTHER_IMAGES = (".nrrd", ".nhdr", ".mha", ".mhd", ".hdr", ".img", ".img.gz", ".m
 NOTES = (
     *(".txt", ".csv", ".tsv", ".xml", ".json", ".yaml", ".yml", ".md", ".html", ".htm", ".log"),
     *(".pdf", ".rtf", ".doc", ".docx", ".xls", ".xlsx", ".png", ".jpg", ".jpeg", ".gif", ".bmp"),
+    *(".ppt", ".pptx", ".tif", ".tiff", ".avi", ".mp4", ".mov", ".wmv", ".mpg"),
 )
 """Ends of names of what people keep beside images; no scanner's file is called so."""
 
 VIEWERS = (
     *(".exe", ".dll", ".msi", ".bat", ".cmd", ".inf", ".ini", ".cfg", ".jar", ".class", ".ico"),
     *(".lnk", ".chm", ".css", ".js", ".svg", ".ttf", ".sys", ".so", ".dylib", ".properties"),
+    *(".dat", ".db", ".ocx", ".config", ".manifest", ".swf", ".icns", ".plist", ".nib", ".lic"),
+    *(".xsl", ".xsd", ".dtd", ".hlp", ".bin", ".cab", ".sh", ".md5", ".url", ".identifier"),
 )
 """Ends of names of the programs that archives put on a disc with the images."""
 

@@ -16,7 +16,7 @@ from nibabel.filebasedimages import ImageFileError
 from nibabel.spatialimages import HeaderDataError
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, corners_apart_mm
+from pipeline.geometry import Float, Float32, corners_apart_mm
 from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.limits import require_bounded
@@ -26,6 +26,8 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
 
+MOST_LABELS = 10
+"""No image of a scanner has so few grey values."""
 VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
 
@@ -133,7 +135,11 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         phases,
         float(own_rr_ms.mean()) / 1000,
     )
-    doubts = *_doubts_of_size(edges_mm, slice_count), *_doubts_of_place(image)
+    doubts = (
+        *_doubts_of_size(edges_mm, slice_count),
+        *_doubts_of_place(image),
+        *_doubts_of_values(cine.intensity[0]),
+    )
     return Stack(cine, triggers, own_rr_ms, source, (), doubts)
 
 
@@ -237,6 +243,16 @@ def _doubts_of_size(edges_mm: Float, slices: int) -> tuple[str, ...]:
         "programs do that save an array alone; pixels of a cine are 1 to 2 mm wide, and its slices "
         "5 to 10 mm apart: if so here, write the affine of the images that these were made of",
     )
+
+
+def _doubts_of_values(phase: Float32) -> tuple[str, ...]:
+    """What speaks against the images of one phase ``(z, y, x)`` being images, in words."""
+    values = np.unique(phase)
+    few = 1 < len(values) <= MOST_LABELS
+    if not few or not np.equal(np.mod(values, 1), 0).all():
+        return ()
+    held = ", ".join(f"{value:g}" for value in values)
+    return (f"its voxels hold {held} alone, as a map of labels does: is it the cine?",)
 
 
 def _doubts_of_place(image: Any) -> tuple[str, ...]:

@@ -122,13 +122,15 @@ def _of_slice_and_series(alike: Sequence[Frame]) -> list[list[Frame]]:
 def _in_order(frames: Iterable[Frame]) -> list[list[Frame]]:
     """Images by number, copies together; none where times or numbers do not leave that open and
     tell it."""
-    by_number: dict[int | None, list[Frame]] = {}
-    for frame in frames:
-        by_number.setdefault(frame.number, []).append(frame)
-    times = {tuple(frame.times_ms.values()) for one in by_number.values() for frame in one}
-    copies = all(
-        np.array_equal(frame.pixels, one[0].pixels) for one in by_number.values() for frame in one
-    )
-    if len(by_number) < MIN_PHASES or len(times) > 1 or None in by_number or not copies:
+    frames = list(frames)
+    if any(frame.number is None for frame in frames):
         return []
-    return [one for _, one in sorted(by_number.items(), key=lambda item: item[0] or 0)]
+    # The same images may be there twice, as classic files and as an Enhanced object.
+    images: dict[bytes, list[Frame]] = {}
+    for frame in sorted(frames, key=lambda one: one.number or 0):
+        images.setdefault(np.ascontiguousarray(frame.pixels).tobytes(), []).append(frame)
+    numbers = {one[0].number for one in images.values()}
+    times = {tuple(frame.times_ms.values()) for frame in frames}
+    if len(images) < MIN_PHASES or len(times) > 1 or len(numbers) < len(images):
+        return []
+    return list(images.values())
