@@ -39,9 +39,10 @@ T_DULL, T_USUAL, T_HIGHER = 0.7, 0.5, 1.5
 """A wave in that time that is less steep for its height than the last beat by the first factor may
 be a T wave, however high. It is one where, of late, as large a share of beats as the second had one
 then, and theirs were no lower than by the third factor."""
-T_NEAR, T_FOLLOW = 4, 1 / 6
+T_NEAR, T_FOLLOW, T_EARLIER = 4, 1 / 6, 0.9
 """Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
-what is known of their energy, follow."""
+what is known of their energy, follow. It is so in this share of the time of T waves: coupled beats
+of a ventricle come at its end, as often as T waves do."""
 SPIKE = 0.65
 """Largest change in half of ``RISE_S``, as a share of that in all of it: half for what is as smooth
 as QRS complexes are, 0.6 for the narrowest, 0.7 and more for a pacemaker's spikes. What follows a
@@ -193,7 +194,7 @@ def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool
     now, rhythm = s.now[0], s.now[0].rhythm
     dull = now.steep * rhythm.last_tall < T_DULL * (rhythm.last_steep * now.tall)
     lower = height < rhythm.last_height and rhythm.last_sharp < SPIKE
-    now.after = dull and lower and since_s < 0.9 * _t_wave_until_s(False, plan, s)
+    now.after = dull and lower and since_s < T_EARLIER * _t_wave_until_s(False, plan, s)
     if not now.after:
         return False
     at = int(since_s / T_STEP_S)
