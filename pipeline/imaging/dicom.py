@@ -15,7 +15,13 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Stack, stack_frames
 from pipeline.imaging.dicom_files import DIRECTORY, DIRECTORY_NAMES, is_bare, told_from_notes
-from pipeline.imaging.dicom_pixels import rescaled, stored_pixels, upright, without_padding
+from pipeline.imaging.dicom_pixels import (
+    rescaled,
+    stored_pixels,
+    upright,
+    whole_number,
+    without_padding,
+)
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
@@ -314,23 +320,16 @@ def _rr_ms(timing: Any, dataset: Any) -> float | None:
 
 def _series_number(dataset: Any) -> int | None:
     """None where the file does not tell, or tells no number: it is a label, no more."""
-    return _whole(dataset.get("SeriesNumber"))
+    return whole_number(dataset.get("SeriesNumber"))
 
 
 def _number(dataset: Any, group: Groups, place: int) -> int | None:
     """The image's number, of frames of one object their order in it or in time behind that."""
-    number = _whole(dataset.get("InstanceNumber"))
+    number = whole_number(dataset.get("InstanceNumber"))
     if "PerFrameFunctionalGroupsSequence" not in dataset:
         return number
-    in_time = _whole(group("FrameContentSequence").get("TemporalPositionIndex"))
+    in_time = whole_number(group("FrameContentSequence").get("TemporalPositionIndex"))
     return MOST_FRAMES * (number or 0) + (place if in_time is None else in_time)
-
-
-def _whole(number: Any) -> int | None:
-    try:
-        return None if number in (None, "") else int(number)
-    except (ValueError, TypeError):
-        return None
 
 
 def _series_name(dataset: Any) -> str:

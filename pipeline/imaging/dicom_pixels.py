@@ -69,7 +69,7 @@ def without_padding(stored: Any, dataset: Any) -> Any:
     is no measurement. It pads what lies outside: saturated blood may have the same value.
     """
     first, limit = (
-        _one_number(dataset.get(name)) for name in ("PixelPaddingValue", "PixelPaddingRangeLimit")
+        whole_number(dataset.get(name)) for name in ("PixelPaddingValue", "PixelPaddingRangeLimit")
     )
     if first is None:
         return stored
@@ -87,7 +87,7 @@ def without_padding(stored: Any, dataset: Any) -> Any:
     return np.where(padding, dark, stored)
 
 
-def _one_number(value: Any) -> int | None:
+def whole_number(value: Any) -> int | None:
     """None where a header does not tell it, or does not tell one whole number."""
     try:
         return None if value in (None, "") else int(value)
