@@ -169,6 +169,16 @@ def test_a_sample_missing_here_and_there_costs_nothing(rate_hz):
     assert usable_times(broken, rate_hz).all()
 
 
+def test_the_line_over_a_gap_tells_nothing_of_a_converter_s_steps():
+    """By these a coarse lead is known, whose stillest moments may well be one value."""
+    coarse = 0.02 * np.round(record().signal_mv / 0.02)
+    for first in np.random.default_rng(7).integers(250, len(coarse), 20):
+        coarse[first : first + 4] = np.nan
+    detector = RPeakDetector(250.0, 3)
+    detector.push(coarse)
+    np.testing.assert_allclose(detector._state.leads["smallest_step"], 0.02)
+
+
 def test_missing_samples_are_a_lost_lead():
     ecg = record()
     broken = ecg.signal_mv.copy()

@@ -52,8 +52,8 @@ def _bridge(k: int, value: float, now: int, plan: Plan, s: State) -> None:
         s.raw[k, at + length] = between
     for i in range(now - count, now):
         _filter(k, i, plan, s)
-    lead.last = s.raw[k, (now - 1) % length]
-    lead.run = 0
+    # A step of the line is none of the lead's.
+    lead.last, lead.run = value, 0
 
 
 @compiled
