@@ -25,7 +25,7 @@ from pipeline.imaging.spacing import fill_gaps, regular_steps
 
 EVENLY = (
     "give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
-    "InstanceNumber where no image of a slice tells its time"
+    "InstanceNumber where each image has one and none of a slice tells its time"
 )
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""

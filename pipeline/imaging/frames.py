@@ -231,14 +231,13 @@ def _spans_beat(frames: Sequence[Frame]) -> bool:
 def _in_one_beat(frames: Sequence[Frame]) -> bool:
     """Whether most slices' times lie within about one RR interval, as those of images in real time
     do not."""
-    beats = [max(map(_beats, one)) for one in by_slice(frames)]
-    return float(np.median(beats)) < MANY_BEATS
+    return float(np.median([max(map(_beats, one)) for one in by_slice(frames)])) < MANY_BEATS
 
 
 def _beats(frame: Frame) -> float:
     """In which heartbeat an image was taken, counted from 0."""
-    time_ms = next(iter(frame.times_ms.values()), 0.0)
-    return time_ms / (frame.rr_ms or LONGEST_RR_MS / MANY_BEATS)
+    rr_ms = frame.rr_ms or LONGEST_RR_MS / MANY_BEATS
+    return next(iter(frame.times_ms.values()), 0.0) / rr_ms
 
 
 def _time_range_ms(frames: Sequence[Frame]) -> tuple[float, float]:
