@@ -65,45 +65,15 @@ types: setup ## static types
 bench: setup ## speed beside peers, as ratios in one run
 	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
 
-TRAIN := $(BIN)/python -m data_synth.training --pool training/pool
-# What runs of training did not see yet, each with all that came after it.
-NO_RARE := --without rare
-NO_ILL := --without ill $(NO_RARE)
-NO_ENDS := --without ends $(NO_ILL)
-NO_BASE := --without base $(NO_ENDS)
-NO_FINE := --without fine $(NO_BASE)
+TRAIN := $(BIN)/python -m data_synth.training --pool training/pool --workers $(WORKERS)
 
-train: setup ## make both networks' weights anew from the phantom (eight hours; needs PyTorch)
+train: setup ## make both networks' weights anew from the phantom (needs PyTorch; a GPU: half an hour)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(TRAIN) --out training --without rims --without bare $(NO_FINE)
-	$(TRAIN) --out training/second $(NO_FINE) --start training/heart.pt \
-		--learning-rate 1e-3 --steps 8000
-	$(TRAIN) --out training/third $(NO_FINE) --seed 1 --hearts 80 \
-		--start training/second/heart.pt --learning-rate 1e-3 --steps 5000
-	$(TRAIN) --out training/fourth $(NO_BASE) --seed 2 --hearts 0 --more 0 240 --more 1 80 \
-		--start training/third/heart.pt --learning-rate 1e-3 --steps 6000
-	$(TRAIN) --out training/fifth $(NO_ENDS) --seed 5 --hearts 140 \
-		--start training/fourth/heart.pt --learning-rate 7e-4 --steps 5500 \
-		--halfway-from training/fourth/heart.pt
-	$(TRAIN) --out training/sixth $(NO_ENDS) --seed 6 --hearts 0 --more 5 140 \
-		--start training/fifth/heart.pt --learning-rate 7e-4 --steps 4500 \
-		--halfway-from training/fifth/heart.pt
-	$(TRAIN) --out training/seventh $(NO_ILL) --seed 7 --hearts 120 --more 5 140 \
-		--start training/sixth/heart.pt --learning-rate 7e-4 --steps 7000 \
-		--halfway-from training/sixth/heart.pt
-	$(TRAIN) --out training/eighth $(NO_ILL) --seed 8 --hearts 0 --more 7 120 --more 5 140 \
-		--start training/seventh/heart.pt --learning-rate 7e-4 --steps 6000 \
-		--halfway-from training/seventh/heart.pt
-	$(TRAIN) --out training/ninth $(NO_RARE) --seed 9 --hearts 0 --more 7 120 --more 5 140 \
-		--start training/eighth/heart.pt --learning-rate 7e-4 --steps 7000
-	$(TRAIN) --out training/tenth $(NO_RARE) --seed 10 --hearts 0 --more 7 120 --more 5 140 \
-		--start training/ninth/heart.pt --learning-rate 7e-4 --steps 5500 \
-		--halfway-from training/eighth/heart.pt
-	$(TRAIN) --out training/eleventh --seed 11 --hearts 0 --more 7 120 --more 5 140 \
-		--start training/tenth/heart.pt --learning-rate 7e-4 --steps 7500 \
-		--halfway-from training/tenth/heart.pt
-	cp training/eleventh/heart.onnx pipeline/imaging/weights/heart.onnx
-	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound
+	$(TRAIN) --out training --steps 87850 --fresh 4 --without span
+	$(TRAIN) --out training/second --start training/heart.pt --seed 1 --hearts 10 --more 0 600 \
+		--learning-rate 4e-4 --steps 2050 --batch 16 --fresh 12 --kept 5000
+	cp training/second/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound --workers $(WORKERS)
 	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 
 $(STAGES): setup

@@ -49,6 +49,7 @@ def train_without(part: str | None, out: Path, pool: Path, start: Path | None, s
     if not (folder / "heart.onnx").exists():
         command = [sys.executable, "-m", "data_synth.training", "--out", str(folder)]
         command += ["--pool", str(pool), "--steps", str(steps), "--export-minutes", "1e9"]
+        command += ["--batch", "8", "--fresh", "8"]
         command += ["--start", str(start), "--learning-rate", "1e-3"] if start else []
         command += ["--without", part] if part else []
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

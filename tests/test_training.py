@@ -1,6 +1,6 @@
 """Training of the segmentation network: what it learns from, and that it can be repeated."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -15,7 +15,13 @@ from data_synth.training.__main__ import main  # noqa: E402
 from data_synth.training.contrast import CLASSES, LABEL_OF, draw_contrast  # noqa: E402
 from data_synth.training.export import write_onnx  # noqa: E402
 from data_synth.training.faults import normalise, spoil  # noqa: E402
-from data_synth.training.loop import TrainSettings, draw_batches, train  # noqa: E402
+from data_synth.training.loop import (  # noqa: E402
+    Batches,
+    Echo,
+    TrainSettings,
+    draw_from,
+    train,
+)
 from data_synth.training.network import PLANES, HeartNet, loss  # noqa: E402
 from data_synth.training.pool import (  # noqa: E402
     PIXEL_MM,
@@ -158,12 +164,32 @@ def test_samples_show_all_structures_and_no_two_are_alike(blocks):
     assert len(np.unique(images, axis=0)) == 40
 
 
-def test_same_seed_gives_the_same_batches(blocks):
-    first, second = (
-        next(draw_batches(list(blocks), TrainSettings(batch=2, seed=4))) for _ in range(2)
-    )
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
+def test_a_batch_depends_on_seed_and_number_alone(blocks):
+    draw = draw_from(list(blocks))
+    one, other = (Batches(draw, 5, 2, seed=4, stream=1) for _ in range(2))
+    other[0]
+    for first, second in zip(one[3], other[3], strict=True):
+        assert torch.equal(first, second)
+    assert not torch.equal(one[3][0], one[2][0])
+    assert not torch.equal(one[3][0], Batches(draw, 5, 2, seed=5, stream=1)[3][0])
+    assert len(list(one)) == len(one) == 5
+
+
+def test_images_are_seen_again_until_others_take_their_place():
+    """Twelve drawn, two at a time; the last eight are kept, and four of them join every batch."""
+    echo, seen = Echo(8, seed=0), []
+    for number in range(6):
+        images = torch.full((2, 1, 1, 1), float(number))
+        batch, labels = echo.joined(images, images[:, 0].byte(), 6)
+        assert torch.equal(batch[:2], images)
+        assert torch.equal(batch[:, 0].byte(), labels)
+        seen.append(batch[2:].flatten().tolist())
+    # Until there are four to see again, none is.
+    assert [len(one) for one in seen] == [0, 0, 4, 4, 4, 4]
+    for number, again in enumerate(seen):
+        assert set(again) <= set(range(max(0, number - 4), number))
+    many = [echo.joined(images, images[:, 0].byte(), 6)[0][2:] for _ in range(3)]
+    assert set(torch.cat(many).flatten().tolist()) <= {2.0, 3.0, 4.0, 5.0}
 
 
 def test_every_tissue_but_those_named_is_background():
@@ -231,17 +257,17 @@ def test_exported_network_computes_what_the_trained_one_does(tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
 
 
-def test_training_repeats_to_the_byte_and_learns(blocks, tmp_path):
-    values = {"a": [], "b": []}
-    settings = TrainSettings(steps=6, batch=2, seed=1)
-    for name in values:
+def test_training_repeats_to_the_byte_whoever_draws(blocks, tmp_path):
+    values = {0: [], 2: []}
+    for workers, into in values.items():
+        settings = TrainSettings(steps=6, batch=3, fresh=2, kept=4, seed=1, workers=workers)
 
-        def note(step, value, minutes, into=values[name]):
+        def note(step, value, minutes, into=into):
             into.append(value)
 
-        train(list(blocks), settings, tmp_path / name, note)
-    assert values["a"] == values["b"]
-    written = [(tmp_path / name / "heart.onnx").read_bytes() for name in values]
+        train(list(blocks), settings, tmp_path / str(workers), note)
+    assert values[0] == values[2]
+    written = [(tmp_path / str(workers) / "heart.onnx").read_bytes() for workers in values]
     assert written[0] == written[1]
     assert len(written[0]) < 10_000_000
 
@@ -249,14 +275,13 @@ def test_training_repeats_to_the_byte_and_learns(blocks, tmp_path):
 def test_training_beats_every_constant_answer(blocks):
     """A network that sees nothing can at best answer the frequencies of the classes."""
     torch.manual_seed(0)
-    batches = draw_batches(list(blocks), TrainSettings(batch=2))
+    batches = Batches(draw_from(list(blocks)), 100, 2, seed=0, stream=1)
     # With next to no heart in view there is nothing to learn from two images.
     images, labels = next(b for b in batches if len(np.unique(b[1][..., 32:96, 32:96])) > 5)
-    images, labels = torch.from_numpy(images[..., 32:96, 32:96]), labels[..., 32:96, 32:96]
-    share = np.bincount(labels.ravel(), minlength=CLASSES) / labels.size
+    images, truth = images[..., 32:96, 32:96], labels[..., 32:96, 32:96].long()
+    share = np.bincount(truth.flatten(), minlength=CLASSES) / truth.numel()
     constant = np.tile(np.log(np.maximum(share, 1e-9)), PLANES)[None, :, None, None]
     scores = torch.from_numpy(np.broadcast_to(constant, (2, PLANES * CLASSES, 64, 64)).copy())
-    truth = torch.from_numpy(labels)
     blind = loss(scores, truth, 0.0).item()
     network = HeartNet()
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3)
@@ -269,34 +294,12 @@ def test_training_beats_every_constant_answer(blocks):
 
 
 def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
-    once = TrainSettings(steps=1, batch=2)
+    once = TrainSettings(steps=1, batch=2, fresh=2)
     train(list(blocks), once, tmp_path)
-    still = TrainSettings(steps=1, batch=2, learning_rate=0.0, start=tmp_path / "heart.pt")
+    still = TrainSettings(steps=1, batch=2, fresh=2, learning_rate=0.0, start=tmp_path / "heart.pt")
     before = torch.load(tmp_path / "heart.pt", weights_only=True)
     after = train(list(blocks), still, tmp_path / "on").state_dict()
     assert torch.equal(before["head.weight"], after["head.weight"])
-
-
-def test_training_ends_half_way_from_any_checkpoint(blocks, tmp_path):
-    train(list(blocks), TrainSettings(steps=1, batch=2), tmp_path)
-    # Others than those that it starts from, where the run's own are written, too.
-    train(list(blocks), TrainSettings(steps=1, batch=2, seed=3), tmp_path / "half")
-    others = torch.load(tmp_path / "half" / "heart.pt", weights_only=True)
-    far = TrainSettings(steps=2, batch=2, start=tmp_path / "heart.pt", export_minutes=0)
-    reached = train(list(blocks), far, tmp_path / "far").state_dict()
-    half = replace(far, halfway_from=tmp_path / "half" / "heart.pt")
-    found = train(list(blocks), half, tmp_path / "half").state_dict()
-    name = "head.weight"
-    assert (reached[name] - others[name]).abs().max() > 1e-5
-    torch.testing.assert_close(found[name], (others[name] + reached[name]) / 2, rtol=0, atol=1e-8)
-
-
-def test_half_way_from_nowhere_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit) as refused:
-        main(["--out", str(tmp_path / "new"), "--halfway-from", str(tmp_path / "none.pt")])
-    assert refused.value.code == 2
-    assert f"--halfway-from: no checkpoint at {tmp_path / 'none.pt'}" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
 
 
 def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
@@ -319,13 +322,38 @@ def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
 
 
 def test_command_line_leaves_a_network(tmp_path, capsys):
-    arguments = ["--out", str(tmp_path), "--hearts", "1", "--steps", "1", "--batch", "2"]
+    arguments = [
+        "--out",
+        str(tmp_path),
+        "--hearts",
+        "1",
+        "--steps",
+        "1",
+        "--batch",
+        "2",
+        "--fresh",
+        "2",
+    ]
     assert main([*arguments, "--pool-only"]) == 0
     assert not (tmp_path / "heart.onnx").exists()
     assert main(arguments) == 0
     assert (tmp_path / "heart.onnx").stat().st_size > 1e6
     assert "pool: 1 of 1 hearts" in capsys.readouterr().out
     # Without hearts of its own seed, those of another are learned from.
-    others = ["--hearts", "0", "--seed", "5", "--more", "0", "1", "--steps", "1", "--batch", "2"]
+    others = [
+        "--hearts",
+        "0",
+        "--seed",
+        "5",
+        "--more",
+        "0",
+        "1",
+        "--steps",
+        "1",
+        "--batch",
+        "2",
+        "--fresh",
+        "2",
+    ]
     assert main(["--out", str(tmp_path / "on"), "--pool", str(tmp_path / "pool"), *others]) == 0
     assert (tmp_path / "on" / "heart.onnx").exists()

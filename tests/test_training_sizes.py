@@ -11,7 +11,13 @@ from scipy import ndimage
 from data_synth.tissue import Tissue
 from data_synth.training.ends import far_right_ventricle, first_ventricle, shut_tip
 from data_synth.training.render import ALL_PARTS, draw_sample
-from data_synth.training.sizes import flat_septum, ill_shape, other_sizes, swollen
+from data_synth.training.sizes import (
+    flat_septum,
+    ill_shape,
+    other_sizes,
+    other_span,
+    swollen,
+)
 
 SIDE, MIDDLE = 96, 48
 ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE].astype(np.float64)
@@ -74,7 +80,8 @@ def test_a_cavity_changes_as_asked_and_nothing_folds(seed, factor):
 def test_a_flat_septum_is_a_chord_as_thick_as_the_arc(flatness, turn, thin):
     plane = short_axis(turn)
     # A right ventricle less deep than the push is long.
-    thin_right = np.where((plane == Tissue.RV_CAVITY) & (AWAY > OUTER + 5), Tissue.FAT, plane)
+    thin_right = plane.copy()
+    thin_right[(plane == Tissue.RV_CAVITY) & (AWAY > OUTER + 5)] = Tissue.FAT
     towards = -np.array([np.sin(turn), np.cos(turn)])
     # All moves go one way: nothing folds if places keep their order along it, and nothing is seen
     # more than three times as large.
@@ -108,16 +115,44 @@ def test_a_flat_septum_is_a_chord_as_thick_as_the_arc(flatness, turn, thin):
         assert change * grown > -10
 
 
-def test_a_plane_along_the_ventricle_or_without_both_keeps_its_septum():
+@given(st.integers(0, 10_000), st.floats(-np.pi, np.pi))
+def test_a_right_ventricle_spans_another_angle_and_nothing_folds(seed, turn):
+    plane = short_axis(turn)
+    places = other_span(np.random.default_rng(seed), plane, ROWS, COLUMNS)
+    # Where angles are most shrunk or stretched, kinks between pixels cost up to half of an area.
+    assert areas(*places).min() > 0
+    # The left ventricle is turned within itself; nothing comes nearer or goes farther away.
+    away = np.hypot(places[0] - MIDDLE, places[1] - MIDDLE)
+    np.testing.assert_allclose(away, AWAY, atol=0.1)
+    # Clear of borders, which pixels show within one of them.
+    clear = (AWAY < OUTER - 1) & (np.abs(AWAY - INNER) > 1)
+    np.testing.assert_array_equal(seen(plane, *places)[clear], plane[clear])
+
+
+def test_right_ventricles_reach_farther_more_often_than_less_far():
+    plane = short_axis()
+    before = (plane == Tissue.RV_CAVITY).sum()
+    sizes = []
+    for seed in range(200):
+        shown = seen(plane, *other_span(np.random.default_rng(seed), plane, ROWS, COLUMNS))
+        sizes.append((shown == Tissue.RV_CAVITY).sum() / before)
+    # Ends are drawn 15 degrees nearer to 45 farther: three in four lie farther.
+    assert np.mean(np.array(sizes) > 1) == pytest.approx(0.8, abs=0.15)
+    assert min(sizes) < 0.95
+    assert max(sizes) > 1.3
+
+
+def test_a_plane_along_the_ventricle_or_without_both_keeps_its_septum_and_span():
     long_axis = short_axis()
     long_axis[(np.abs(COLUMNS - MIDDLE) < 8) & (ROWS < MIDDLE)] = Tissue.LV_MYOCARDIUM
     no_right, no_left = short_axis(), short_axis()
     no_right[no_right == Tissue.RV_CAVITY] = Tissue.LUNG
     no_left[AWAY < OUTER] = Tissue.LUNG
     for plane in (long_axis, no_right, no_left):
-        rows, columns = flat_septum(plane, ROWS, COLUMNS, 0.5)
-        np.testing.assert_array_equal(rows, ROWS)
-        np.testing.assert_array_equal(columns, COLUMNS)
+        spanned = other_span(np.random.default_rng(0), plane, ROWS, COLUMNS)
+        for rows, columns in (flat_septum(plane, ROWS, COLUMNS, 0.5), spanned):
+            np.testing.assert_array_equal(rows, ROWS)
+            np.testing.assert_array_equal(columns, COLUMNS)
 
 
 def test_hearts_at_their_worst_are_a_third_of_all_and_of_all_kinds():

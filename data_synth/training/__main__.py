@@ -17,10 +17,7 @@ from data_synth.training.render import Parts
 
 def main(arguments: list[str] | None = None) -> int:
     """Fill the pool, train, and leave `heart.onnx` in the folder given by `--out`."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if options.halfway_from and not options.halfway_from.is_file():
-        parser.error(f"--halfway-from: no checkpoint at {options.halfway_from}")
+    options = _parser().parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
     folder = options.pool or options.out / "pool"
@@ -35,13 +32,15 @@ def main(arguments: list[str] | None = None) -> int:
         steps=options.steps,
         minutes=options.minutes,
         batch=options.batch,
+        fresh=options.fresh,
+        kept=options.kept,
         learning_rate=options.learning_rate,
         start=options.start,
-        halfway_from=options.halfway_from,
         parts=Parts(**dict.fromkeys(options.without, False)),
         seed=options.seed,
         export_minutes=options.export_minutes,
         threads=options.threads,
+        workers=options.workers,
     )
     recent: list[float] = []
 
@@ -58,20 +57,18 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m data_synth.training", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of pool and network")
-    parser.add_argument("--hearts", type=int, default=240, help="hearts in the pool")
+    parser.add_argument("--hearts", type=int, default=600, help="hearts in the pool")
     parser.add_argument(
         "--more", action="append", default=[], nargs=2, type=int, metavar=("SEED", "HEARTS"),
         help="hearts of another seed besides",
     )  # fmt: skip
     parser.add_argument("--spread", type=float, default=1.6, help="how far hearts are from mean")
-    parser.add_argument("--steps", type=int, default=16_000, help="batches to learn from")
-    parser.add_argument("--batch", type=int, default=8, help="images in a batch")
+    parser.add_argument("--steps", type=int, default=100_000, help="batches to learn from")
+    parser.add_argument("--batch", type=int, default=64, help="images in a batch")
+    parser.add_argument("--fresh", type=int, default=8, help="of them drawn anew")
+    parser.add_argument("--kept", type=int, default=60_000, help="images kept to be seen again")
     parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
     parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
-    parser.add_argument(
-        "--halfway-from", type=Path, metavar="START",
-        help="heart.pt to end half-way from, between its weights and those learned",
-    )  # fmt: skip
     parser.add_argument(
         "--without", action="append", default=[], choices=[part.name for part in fields(Parts)],
         help="leave a part of the randomisation out, to see what it is worth",
@@ -80,7 +77,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time")
     parser.add_argument("--export-minutes", type=float, default=5.0, help="time between exports")
     parser.add_argument("--threads", type=int, default=1, help="threads of the network's own")
-    parser.add_argument("--workers", type=int, default=2, help="processes that fill the pool")
+    parser.add_argument(
+        "--workers", type=int, default=2, help="processes that draw hearts and images"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pool-only", action="store_true", help="fill the pool and stop")
     return parser

@@ -7,7 +7,9 @@ network learns shapes and relations, not one machine's grey values.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -59,6 +61,18 @@ IN_HEART = _table(dict.fromkeys((*BLOOD, *WALLS[:4], *COUNTED_AS, Tissue.LV_MYOC
     bool
 )
 """Whether a tissue belongs to the heart or its great vessels."""
+
+
+@cache
+def _chosen(tissues: tuple[Tissue, ...]) -> Label:
+    return _table(dict.fromkeys(tissues, 1))
+
+
+def among(tissue: Label, tissues: tuple[Tissue, ...]) -> Mask:
+    """Where a tissue is one of some; many times as fast as `np.isin`."""
+    flat = cv2.LUT(np.ascontiguousarray(tissue).reshape(1, -1), _chosen(tissues))
+    return np.asarray(flat.reshape(tissue.shape).view(np.bool_))
+
 
 IS_BLOOD = _table(dict.fromkeys(BLOOD, 1)).astype(bool)
 """Whether a tissue is blood in a chamber or the aorta."""

@@ -51,6 +51,7 @@ class Coverings:
             self.fluid_px = np.clip(rng.uniform(1.5, 10.0) * (1 + uneven), 0, 12.0)
             self.fat_px = np.minimum(self.fat_px, rng.uniform(0.0, 3.0))
             self.fluid = contrast.mean[Tissue.LV_CAVITY] * rng.uniform(0.7, 2.0)
+        self.most_px = float((self.fat_px + self.fluid_px).max()) + self.sac_px + 1
 
     def paint(self, signed: Float32, tissue: Label) -> None:
         """Cover the heart in one plane, in place.
@@ -66,12 +67,12 @@ class Coverings:
         if not inside.any():
             return
         away_px = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 3)
+        near = (away_px > 0) & (away_px < self.most_px)
+        fat_px = self.fat_px[near]
+        fluid_px = np.where(_DRY[tissue[near]], 0, self.fluid_px[near])
+        ends_px = np.stack([fat_px, fat_px + fluid_px, fat_px + fluid_px + self.sac_px])
         # A pixel at distance d reaches from d - 1 to d beyond the outline between pixels.
-        fluid_px = np.where(_DRY[tissue], 0, self.fluid_px)
-        ends_px = np.stack([self.fat_px, self.fat_px + fluid_px])
-        ends_px = np.stack([*ends_px, ends_px[1] + self.sac_px])
-        near = (away_px > 0) & (away_px < ends_px[2].max() + 1)
-        covered = np.clip(ends_px[:, near] - (away_px[near] - 1), 0, 1)
+        covered = np.clip(ends_px - (away_px[near] - 1), 0, 1)
         of_fat, of_fluid, of_sac = np.diff(covered, axis=0, prepend=np.float32(0))
         beyond = (1 - covered[2]) * signed[near]
         signed[near] = of_fat * self.fat + of_fluid * self.fluid + of_sac * self.sac + beyond

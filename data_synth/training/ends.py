@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.tissue import Tissue
-from data_synth.training.contrast import IN_HEART
+from data_synth.training.contrast import IN_HEART, among
 
 Label = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -41,7 +41,7 @@ def lowest_atrium(planes: Label) -> int | None:
     if not area.any() or lowest < 1 or area[lowest:].max() < _LEAST_AREA:
         return None
     below = planes[lowest - 1]
-    cut = (np.count_nonzero(np.isin(below, tissues)) for tissues in (_INSIDE, _RIGHT))
+    cut = (np.count_nonzero(among(below, tissues)) for tissues in (_INSIDE, _RIGHT))
     return lowest if min(cut) >= _LEAST_AREA else None
 
 
@@ -66,10 +66,10 @@ def low_atrium(rng: np.random.Generator, planes: Label, lowest: int, farther: in
     full = lowest + int(np.argmax(area >= 0.6 * area.max()))
     atrium = (planes[full] == Tissue.RIGHT_ATRIUM).astype(np.uint8)
     depth_px = cv2.distanceTransform(atrium, cv2.DIST_L2, 5)
-    towards = _middle(np.isin(planes[lowest - 1], _RIGHT)) - _middle(atrium)
+    towards = _middle(among(planes[lowest - 1], _RIGHT)) - _middle(atrium)
     towards *= rng.uniform(0.0, 1.0)
-    outflow = np.isin(planes[full], _RIGHT)
-    outflow = outflow if outflow.any() else np.isin(planes[lowest - 1], _RIGHT)
+    outflow = among(planes[full], _RIGHT)
+    outflow = outflow if outflow.any() else among(planes[lowest - 1], _RIGHT)
     away = _middle(atrium) - _middle(outflow)
     away /= max(float(np.linalg.norm(away)), 1.0)
     rows, columns = np.indices(atrium.shape)
@@ -82,15 +82,15 @@ def low_atrium(rng: np.random.Generator, planes: Label, lowest: int, farther: in
         body = _moved((depth_px > least_px).astype(np.uint8), 1.0, share * towards) > 0
         # What lies beyond the atrium, seen from the outflow, is no ventricle any more.
         beyond_px = along_px[body].mean() + (3 * share - 0.5) * depth_px.max()
-        body |= np.isin(lower[number], _RIGHT) & (along_px > beyond_px)
+        body |= among(lower[number], _RIGHT) & (along_px > beyond_px)
         _put_atrium(lower[number], body, leaflet)
     return lower
 
 
 def _put_atrium(plane: Label, body: Mask, leaflet: bool) -> None:
     """Draw the right atrium into a plane, and leave the right ventricle one part of itself."""
-    body = (body | (plane == Tissue.RIGHT_ATRIUM)) & ~np.isin(plane, _KEPT)
-    rest = np.isin(plane, _RIGHT) & ~body
+    body = (body | (plane == Tissue.RIGHT_ATRIUM)) & ~among(plane, _KEPT)
+    rest = among(plane, _RIGHT) & ~body
     count, part, sizes, _ = cv2.connectedComponentsWithStats(rest.astype(np.uint8), connectivity=4)
     if count > 1:
         body |= rest & (part != 1 + np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
@@ -98,7 +98,7 @@ def _put_atrium(plane: Label, body: Mask, leaflet: bool) -> None:
     rim = (cv2.dilate(body.astype(np.uint8), _BRUSH) > 0) & ~body
     plane[rim & ~IN_HEART[plane]] = Tissue.ATRIAL_WALL
     if leaflet:
-        plane[rim & np.isin(plane, _RIGHT)] = Tissue.LEAFLET
+        plane[rim & among(plane, _RIGHT)] = Tissue.LEAFLET
 
 
 def first_ventricle(planes: Label) -> int | None:
@@ -109,7 +109,7 @@ def first_ventricle(planes: Label) -> int | None:
     planes
         ``(plane, row, column)`` tissue, the apex first.
     """
-    area = np.count_nonzero(np.isin(planes, _INSIDE), axis=(1, 2))
+    area = np.count_nonzero(among(planes, _INSIDE), axis=(1, 2))
     return int(np.argmax(area >= _LEAST_AREA)) if (area >= _LEAST_AREA).any() else None
 
 
@@ -128,13 +128,13 @@ def far_right_ventricle(planes: Label, farther: int) -> Label:
         Planes by which its tip reaches down; its widest cut stays where it is.
     """
     lower = planes.copy()
-    area = np.count_nonzero(np.isin(planes, _RIGHT), axis=(1, 2))
+    area = np.count_nonzero(among(planes, _RIGHT), axis=(1, 2))
     widest, tip = int(area.argmax()), int(np.argmax(area > 0))
     for number in range(max(tip - farther, 0), widest):
         # The nearer to the widest cut, the less it moves.
         share = min(1.0, (widest - number) / max(widest - tip, 1))
         above = min(number + round(farther * share), widest)
-        left, beside = np.isin(planes[above], _LEFT), np.isin(planes[above], _RIGHT)
+        left, beside = among(planes[above], _LEFT), among(planes[above], _RIGHT)
         if above > number and left.any() and np.count_nonzero(beside) >= _LEAST_AREA:
             _put_right_ventricle(lower[number], planes[above])
     return lower
@@ -142,23 +142,21 @@ def far_right_ventricle(planes: Label, farther: int) -> Label:
 
 def _put_right_ventricle(plane: Label, above: Label) -> None:
     """Draw the right ventricle of the plane ``above`` against the left one of this plane."""
-    left, left_above = (np.isin(one, _LEFT) for one in (plane, above))
-    right_above = np.isin(above, _RIGHT)
+    left, left_above = (among(one, _LEFT) for one in (plane, above))
+    right_above = among(above, _RIGHT)
     middle = _middle(left) if left.any() else _middle(left_above)
     towards = _middle(right_above) - _middle(left_above)
     towards /= max(float(np.linalg.norm(towards)), 1.0)
     nearer = np.sqrt(left_above.sum() / np.pi) - np.sqrt(left.sum() / np.pi)
     shift = middle - _middle(left_above) - nearer * towards
     put = right_above | (above == Tissue.RV_WALL)
-    right = (_moved(put.astype(np.uint8), 1.0, shift) > 0) | np.isin(
-        plane, (*_RIGHT, Tissue.RV_WALL)
-    )
+    right = (_moved(put.astype(np.uint8), 1.0, shift) > 0) | among(plane, (*_RIGHT, Tissue.RV_WALL))
     # A crescent bent about a larger circle leaves gaps beside a smaller one.
     both = cv2.morphologyEx((right | left).astype(np.uint8), cv2.MORPH_CLOSE, _CLOSING) > 0
     # The diaphragm, a sheet of muscle, gives way.
-    chest = np.isin(plane, _CHEST).astype(np.uint8)
+    chest = among(plane, _CHEST).astype(np.uint8)
     chest = cv2.morphologyEx(chest, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
-    right = both & ~chest & ~np.isin(plane, (*_KEPT, Tissue.RIGHT_ATRIUM))
+    right = both & ~chest & ~among(plane, (*_KEPT, Tissue.RIGHT_ATRIUM))
     inside = right & (cv2.erode((right | left).astype(np.uint8), _BRUSH) > 0)
     knots = _moved((above == Tissue.RV_TRABECULA).astype(np.uint8), 1.0, shift) > 0
     plane[right] = Tissue.RV_WALL
@@ -184,8 +182,8 @@ def other_tip(rng: np.random.Generator, planes: Label, last: int, height: float)
         Planes from there to the end of the muscle.
     """
     drawn = planes.copy()
-    whole = np.isin(planes[last], _LEFT).astype(np.uint8)
-    inside = np.isin(planes[last], _INSIDE).astype(np.uint8)
+    whole = among(planes[last], _LEFT).astype(np.uint8)
+    inside = among(planes[last], _INSIDE).astype(np.uint8)
     if not inside.any():
         return drawn
     hollow = max(height - rng.uniform(0.3, 3.5), 0.5)
@@ -203,7 +201,7 @@ def other_tip(rng: np.random.Generator, planes: Label, last: int, height: float)
                 size = np.sqrt(1 - (away / end) ** bluntness)
                 put = _moved(body, size, away * drift, _middle(inside)) > 0
                 plane[put] = tissue
-        left = np.isin(plane, _LEFT).astype(np.uint8)
+        left = among(plane, _LEFT).astype(np.uint8)
         if skin:
             beside = (cv2.dilate(left, _BRUSH) > 0) & ~IN_HEART[plane]
             plane[beside] = Tissue.PERICARDIUM
@@ -224,7 +222,7 @@ def shut_tip(planes: Label, closed: int, over: int) -> Label:
     """
     shut = planes.copy()
     for number in range(min(closed + over, len(planes))):
-        inside = np.isin(planes[number], _INSIDE)
+        inside = among(planes[number], _INSIDE)
         depth_px = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
         share = max(number - closed + 1, 0) / (over + 1)
         shut[number][inside & (depth_px <= (1 - share) * depth_px.max())] = Tissue.LV_MYOCARDIUM
@@ -233,9 +231,7 @@ def shut_tip(planes: Label, closed: int, over: int) -> Label:
 
 def _clear(plane: Label, everything: bool) -> None:
     """Take the left ventricle, or the whole heart, out of a plane; what lies around fills in."""
-    gone = (IN_HEART[plane] if everything else np.isin(plane, _LEFT)) | (
-        plane == Tissue.PERICARDIUM
-    )
+    gone = (IN_HEART[plane] if everything else among(plane, _LEFT)) | (plane == Tissue.PERICARDIUM)
     around = ~gone & ~IN_HEART[plane]
     if not gone.any() or not around.any():
         return

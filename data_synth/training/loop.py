@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import copy
 import math
-import queue
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from data_synth.training.export import write_onnx
 from data_synth.training.network import HeartNet, UNet, loss
@@ -24,14 +24,25 @@ Label = npt.NDArray[np.uint8]
 Report = Callable[[int, float, float], None]
 Net = TypeVar("Net", bound=UNet)
 
+HEART_STREAM = 7002
+"""Keeps what is drawn for this network apart from what is drawn for others of the same seed."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrainSettings:
     """How long and how fast to learn; steps or minutes, whichever ends first."""
 
-    steps: int = 16_000
+    steps: int = 100_000
     minutes: float = math.inf
-    batch: int = 8
+    batch: int = 64
+    fresh: int = 8
+    """Images of a batch that are drawn anew; the others are seen again. Drawing takes longer than
+    learning on a graphics processor (Choi et al., "Faster neural network training with data
+    echoing", 2019)."""
+
+    kept: int = 60_000
+    """Images kept to be seen again, the last ones drawn: 147 KB each."""
+
     learning_rate: float = 2e-3
     overlap_weight: tuple[float, float] = (1.0, 0.2)
     """Of the Dice term at the start and at the end: it makes small structures appear early, and
@@ -41,33 +52,73 @@ class TrainSettings:
     start: Path | None = None
     """Checkpoint to go on from; by default weights are drawn at random."""
 
-    halfway_from: Path | None = None
-    """Checkpoint to end half-way from, between its weights and those learned: what is new is
-    learned and what was known kept (Wortsman et al., "Robust fine-tuning of zero-shot models",
-    CVPR 2022).
-    Running statistics are averaged like weights. What is exported on the way is not half-way."""
-
     parts: Parts = ALL_PARTS
     """What is drawn at random in the images."""
 
     seed: int = 0
     export_minutes: float = 5.0
     threads: int = 1
+    workers: int = 0
+    """Processes that draw; 0: the one that learns draws, too. Their number changes no image."""
 
 
-Batch = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
+Sample = tuple[npt.NDArray[np.float32], Label]
+"""Image ``(channel, row, column)`` and labels, ``(..., row, column)``."""
+
+Draw = Callable[[np.random.Generator], Sample]
 Loss = Callable[[Any, Any, float], Any]
 """Of scores and labels, with the weight of the Dice term."""
 
 
-def draw_batches(blocks: Sequence[Label], settings: TrainSettings) -> Iterator[Batch]:
-    """Endless batches of ``(n, 3, row, column)`` images and labels; the seed fixes them all."""
-    rng = np.random.default_rng([settings.seed, 7002])
-    while True:
-        picks = rng.integers(len(blocks), size=settings.batch)
-        samples = [draw_sample(rng, blocks[pick], settings.parts) for pick in picks]
-        images = np.stack([sample.image for sample in samples])
-        yield images, np.stack([sample.labels for sample in samples]).astype(np.int64)
+class Batches(Dataset):  # type: ignore[misc]  # torch is not type-checked
+    """Batches of what ``draw`` gives; the seed, the stream and a batch's number fix it."""
+
+    def __init__(self, draw: Draw, count: int, size: int, seed: int, stream: int) -> None:
+        self.draw, self.count, self.size, self.seeds = draw, count, size, (seed, stream)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, number: int) -> tuple[Any, Any]:
+        """Images ``(n, channel, row, column)`` float32 and labels uint8, as tensors."""
+        if number >= self.count:
+            raise IndexError(number)
+        rng = np.random.default_rng([*self.seeds, number])
+        images, labels = zip(*(self.draw(rng) for _ in range(self.size)), strict=True)
+        return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(labels))
+
+
+class Echo:
+    """The last images drawn, to be seen again.
+
+    What was drawn at the beginning is replaced first. Images are kept in half precision, which
+    the network's own arithmetic is coarser than.
+    """
+
+    def __init__(self, kept: int, seed: int) -> None:
+        self.kept, self.drawn = kept, 0
+        self.picks = torch.Generator().manual_seed(seed)
+        self.images: Any = None
+        self.labels: Any = None
+
+    def joined(self, images: Any, labels: Any, size: int) -> tuple[Any, Any]:
+        """A batch of ``size``, those given first, which are kept; those alone at the beginning."""
+        fresh, held = len(images), min(self.drawn, self.kept)
+        if size <= fresh:
+            return images, labels
+        if self.images is None:
+            shape, device = (self.kept,), images.device
+            self.images = torch.empty(shape + images.shape[1:], dtype=torch.float16, device=device)
+            self.labels = torch.empty(shape + labels.shape[1:], dtype=labels.dtype, device=device)
+        # Two sizes in all: the best way to compute is sought anew for each.
+        count = size - fresh if held >= size - fresh else 0
+        again = torch.randint(max(held, 1), (count,), generator=self.picks).to(images.device)
+        both = torch.cat([images, self.images[again].float()])
+        of_both = torch.cat([labels, self.labels[again]])
+        places = (torch.arange(self.drawn, self.drawn + fresh) % self.kept).to(images.device)
+        self.images[places], self.labels[places] = images.half(), labels
+        self.drawn += fresh
+        return both, of_both
 
 
 class Average:
@@ -81,12 +132,13 @@ class Average:
         """Take in the weights after one more step."""
         self.steps += 1
         keep = min(0.997, self.steps / (self.steps + 20))
+        means, news = (one.state_dict().values() for one in (self.network, network))
+        pairs = list(zip(means, news, strict=True))
         with torch.no_grad():
-            pairs = zip(self.network.state_dict().values(), network.state_dict().values())  # noqa: B905
+            numbers = [pair for pair in pairs if pair[0].dtype.is_floating_point]
+            torch._foreach_lerp_(*map(list, zip(*numbers, strict=True)), 1 - keep)
             for mean, new in pairs:
-                if mean.dtype.is_floating_point:
-                    mean.mul_(keep).add_(new, alpha=1 - keep)
-                else:
+                if not mean.dtype.is_floating_point:
                     mean.copy_(new)
 
 
@@ -94,13 +146,24 @@ def train(
     blocks: Sequence[Label], settings: TrainSettings, out: Path, report: Report | None = None
 ) -> HeartNet:
     """Train the network of MR, writing ``out/heart.onnx`` and ``out/heart.pt``: see `learn`."""
-    batches = draw_batches(blocks, settings)
-    return learn(HeartNet, batches, loss, settings, out / "heart", report)
+    draw = draw_from(blocks, settings.parts)
+    return learn(HeartNet, draw, HEART_STREAM, loss, settings, out / "heart", report)
+
+
+def draw_from(blocks: Sequence[Label], parts: Parts = ALL_PARTS) -> Draw:
+    """What draws an image of any of the blocks, and its labels."""
+
+    def draw(rng: np.random.Generator) -> Sample:
+        sample = draw_sample(rng, blocks[int(rng.integers(len(blocks)))], parts)
+        return sample.image, sample.labels
+
+    return draw
 
 
 def learn(
     make: Callable[[], Net],
-    batches: Iterator[Batch],
+    draw: Draw,
+    stream: int,
     loss_of: Loss,
     settings: TrainSettings,
     out: Path,
@@ -108,21 +171,37 @@ def learn(
 ) -> Net:
     """Train a network, writing ``out`` as ``.onnx`` and ``.pt`` now and then and at the end.
 
-    The result depends on the batches, the seed and the number of steps alone (on one kind of
-    processor) when ``minutes`` does not cut it short.
+    A graphics processor learns where torch finds one. The result depends on what is drawn, the
+    seed and the number of steps alone (on one kind of processor; a graphics processor's sums come
+    in no fixed order) when ``minutes`` does not cut it short.
+
+    Parameters
+    ----------
+    make
+        The network, with weights drawn at random by torch's own generator.
+    draw
+        One image and its labels.
+    stream
+        Keeps what is drawn apart from what is drawn for another network.
+    loss_of
+        What is made small.
     """
-    torch.manual_seed(settings.seed)
     torch.set_num_threads(settings.threads)
+    torch.backends.cudnn.benchmark = True
+    fresh = min(settings.fresh, settings.batch)
+    batches = _ahead(Batches(draw, settings.steps, fresh, settings.seed, stream), settings)
+    # After the processes that draw have started, which takes a random number.
+    torch.manual_seed(settings.seed)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = make().to(memory_format=torch.channels_last)
     if settings.start is not None:
         network.load_state_dict(torch.load(settings.start, weights_only=True))
-    # Before anything is written: it may lie where this run's own checkpoints will.
-    others = torch.load(settings.halfway_from, weights_only=True) if settings.halfway_from else None
-    average = Average(network)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3)
+    network = network.to(device)
+    average, echo = Average(network), Echo(settings.kept, settings.seed)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3, fused=True)
     started_s = time.monotonic()
     exported_s = started_s
-    for step, batch in enumerate(_ahead(batches, settings.steps)):
+    for step, (images, labels) in enumerate(batches):
         minutes = (time.monotonic() - started_s) / 60
         done = max(step / settings.steps, minutes / settings.minutes)
         if done >= 1:
@@ -131,30 +210,39 @@ def learn(
         first, final = settings.overlap_weight
         first = final if settings.start else first
         weight = first + done * (final - first)
-        value = _learn(network, optimiser, batch, rate, weight, loss_of)
+        images, labels = (one.to(device, non_blocking=True) for one in (images, labels))
+        batch = echo.joined(images, labels, settings.batch)
+        value = _learn(network, optimiser, *batch, rate, weight, loss_of)
         average.update(network)
         if report is not None:
             report(step + 1, value, minutes)
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
             save(out, average.network)
-    if others is not None:
-        move_halfway(average.network, others)
     save(out, average.network)
     return average.network
 
 
-def move_halfway(network: UNet, others: Mapping[str, Any]) -> None:
-    """Replace weights and running statistics by their mean with ``others``."""
-    with torch.no_grad():
-        for name, value in network.state_dict().items():
-            if value.dtype.is_floating_point:
-                value.add_(others[name]).div_(2)
+def _ahead(batches: Batches, settings: TrainSettings) -> Iterator[tuple[Any, Any]]:
+    """All batches in turn, drawn ahead by other processes where there are any."""
+    if settings.workers == 0:
+        return iter(batches)
+    # Forked processes share the blocks that are drawn from, but not OpenCV's threads.
+    cv2.setNumThreads(1)
+    return iter(
+        DataLoader(
+            batches,
+            batch_size=None,
+            num_workers=settings.workers,
+            multiprocessing_context="fork",
+            prefetch_factor=8,
+        )
+    )
 
 
 def save(out: Path, network: UNet) -> None:
     """Write the network as ``out.onnx`` and as a checkpoint of torch's, ``out.pt``."""
-    network.eval()
+    network = copy.deepcopy(network).cpu().eval()
     write_onnx(out.with_suffix(".onnx"), network)
     torch.save(network.state_dict(), out.with_suffix(".pt"))
 
@@ -167,54 +255,21 @@ def _rate(done: float, step: int) -> float:
 def _learn(
     network: UNet,
     optimiser: Any,
-    batch: Batch,
+    images: Any,
+    labels: Any,
     rate: float,
     overlap_weight: float,
     loss_of: Loss,
 ) -> float:
     """One step of gradient descent; returns the loss."""
-    images = torch.from_numpy(batch[0]).to(memory_format=torch.channels_last)
-    labels = torch.from_numpy(batch[1])
     for group in optimiser.param_groups:
         group["lr"] = rate
     network.train()
-    with torch.autocast("cpu", torch.bfloat16):
-        scores = network(images)
-    value = loss_of(scores, labels, overlap_weight)
+    with torch.autocast(images.device.type, torch.bfloat16):
+        scores = network(images.contiguous(memory_format=torch.channels_last))
+    value = loss_of(scores, labels.long(), overlap_weight)
     optimiser.zero_grad(set_to_none=True)
     value.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
     optimiser.step()
     return float(value.item())
-
-
-def _ahead(batches: Iterator[Batch], count: int) -> Iterator[Batch]:
-    """The first ``count`` batches, drawn by a second thread while the first one learns."""
-    ready: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=6)
-    stop = threading.Event()
-
-    def draw() -> None:
-        try:
-            for _, batch in zip(range(count), batches, strict=False):
-                while not stop.is_set():
-                    try:
-                        ready.put(batch, timeout=1.0)
-                        break
-                    except queue.Full:
-                        continue
-                if stop.is_set():
-                    return
-        except Exception as error:
-            ready.put(error)
-
-    worker = threading.Thread(target=draw, daemon=True)
-    worker.start()
-    try:
-        for _ in range(count):
-            item = ready.get()
-            if isinstance(item, BaseException):
-                raise item
-            yield item
-    finally:
-        stop.set()
-        worker.join()

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from data_synth.training.contrast import CLASSES
 
-WIDTHS = (16, 32, 64, 128, 192)
+WIDTHS = (16, 40, 88, 168, 272)
 """Channels at full, half, ... resolution."""
 
 PLANES = 3
@@ -86,9 +86,8 @@ def loss(scores: Any, labels: Any, overlap_weight: float = 1.0) -> Any:
     scores = scores.float().reshape(-1, CLASSES, rows * columns)
     labels = labels.reshape(-1, 1, rows * columns)
     log_chance = torch.log_softmax(scores, dim=1)
-    of_truth = log_chance.gather(1, labels)
-    # Sums by class without one-hot arrays, which would cost more than the network's head.
-    overlap = torch.zeros(CLASSES).index_add(0, labels.flatten(), of_truth.exp().flatten())
-    size = log_chance.exp().sum((0, 2)) + torch.bincount(labels.flatten(), minlength=CLASSES)
-    dice = (2 * overlap + 1) / (size + 1)
-    return -of_truth.mean() + overlap_weight * (1 - dice[1:].mean())
+    chance = log_chance.exp()
+    truth = labels == torch.arange(CLASSES, device=labels.device)[None, :, None]
+    overlap = torch.where(truth, chance, 0).sum((0, 2))
+    dice = (2 * overlap + 1) / (chance.sum((0, 2)) + truth.sum((0, 2)) + 1)
+    return -log_chance.gather(1, labels).mean() + overlap_weight * (1 - dice[1:].mean())

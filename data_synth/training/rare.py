@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.tissue import Tissue
-from data_synth.training.contrast import IN_HEART
+from data_synth.training.contrast import IN_HEART, among
 from data_synth.training.walls import closed_ring
 
 Float = npt.NDArray[np.floating]
@@ -41,9 +41,9 @@ def thick_right_walled(planes: Label, layers: int) -> Label:
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * layers + 1, 2 * layers + 1))
     thicker = planes.copy()
     for plane in thicker:
-        right = np.isin(plane, _RIGHT).astype(np.uint8)
+        right = among(plane, _RIGHT).astype(np.uint8)
         grown = cv2.dilate(right, brush) > 0
-        plane[grown & ~IN_HEART[plane] & ~np.isin(plane, _KEPT)] = Tissue.RV_WALL
+        plane[grown & ~IN_HEART[plane] & ~among(plane, _KEPT)] = Tissue.RV_WALL
     return thicker
 
 
@@ -63,7 +63,7 @@ class Scar:
 
 def draw_scar(rng: np.random.Generator, plane: Label) -> Scar | None:
     """A scar on any side of the left ventricle, if the plane cuts it well."""
-    left = np.argwhere(np.isin(plane, _LEFT))
+    left = np.argwhere(among(plane, _LEFT))
     if len(left) < _LEAST_AREA:
         return None
     angle = rng.uniform(0, 2 * np.pi)
@@ -90,7 +90,7 @@ def scarred(rng: np.random.Generator, planes: Label, scar: Scar) -> Label:
     away = np.hypot(rows - place[0], columns - place[1])
     for number, plane in enumerate(thinner):
         size = 1 - ((number - centre) / through) ** 2
-        left, inside = np.isin(plane, _LEFT), np.isin(plane, _INSIDE)
+        left, inside = among(plane, _LEFT), among(plane, _INSIDE)
         if size <= 0 or not closed_ring(plane):
             continue
         # Thin over the inner six tenths of its reach; from there to its rim all of the wall stays.

@@ -32,7 +32,7 @@ from data_synth.training.ends import (
 )
 from data_synth.training.faults import smooth_noise, spoil, spoil_little, windowed
 from data_synth.training.rare import bulged, draw_scar, scarred, thick_right_walled
-from data_synth.training.sizes import Places, ill_shape, other_sizes, swollen
+from data_synth.training.sizes import Places, ill_shape, other_sizes, other_span, swollen
 from data_synth.training.walls import (
     laid_bare,
     last_ring,
@@ -105,6 +105,9 @@ class Parts:
     """Infarcts that leave a wall thin and bulging, right ventricles with thick walls, left ones
     full of trabeculae, and fluid about the heart."""
 
+    span: bool = True
+    """Right ventricles that reach farther about the left one, or less far."""
+
 
 ALL_PARTS = Parts()
 
@@ -142,6 +145,8 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
         rows, columns = other_sizes(rng, planes[REACH], rows, columns)
     if parts.ill and parts.shape:
         rows, columns = ill_shape(rng, planes[REACH], rows, columns)
+    if parts.span and parts.shape and rng.random() < 0.4:
+        rows, columns = other_span(rng, planes[REACH], rows, columns)
     if scar is not None and parts.shape and rng.random() < 0.6:
         rows, columns = bulged(rng, scar, rows, columns)
     image = np.empty((3, CROP, CROP), np.float32)

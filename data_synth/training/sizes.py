@@ -6,9 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.tissue import Tissue
+from data_synth.training.contrast import among
 
 Float = npt.NDArray[np.floating]
 Label = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 Places = tuple[Float, Float]
 """Row and column in a plane at which each pixel of an image is taken."""
 
@@ -107,17 +109,11 @@ def flat_septum(plane: Label, rows: Float, columns: Float, flatness: float) -> P
     flatness
         How far the chord lies inside the arc, in radii of the left ventricle, below 1.
     """
-    left, right = np.isin(plane, _LEFT), np.isin(plane, _RIGHT)
-    if min(left.sum(), right.sum()) < _LEAST_AREA:
+    cut = _short_axis(plane)
+    if cut is None:
         return rows, columns
-    middle = np.argwhere(left).mean(axis=0)
-    farthest = np.linalg.norm(np.argwhere(left) - middle, axis=1).max()
-    if left.sum() < _LEAST_ROUND * np.pi * farthest**2:
-        return rows, columns
-    towards = np.argwhere(right).mean(axis=0) - middle
-    towards /= max(float(np.linalg.norm(towards)), 1e-6)
-    radius = np.sqrt(left.sum() / np.pi)
-    wall = radius - np.sqrt(np.isin(plane, _LEFT[:2]).sum() / np.pi)
+    right, middle, towards, radius = cut
+    wall = radius - np.sqrt(among(plane, _LEFT[:2]).sum() / np.pi)
     reach = ((np.argwhere(right) - middle) @ towards).max()
     chord = (1 - flatness) * radius
     along = (rows - middle[0]) * towards[0] + (columns - middle[1]) * towards[1]
@@ -128,3 +124,53 @@ def flat_septum(plane: Label, rows: Float, columns: Float, flatness: float) -> P
     fading = np.interp(along, [-radius, chord - wall, chord, far], [0.0, 1.0, 1.0, 0.0])
     moved = pushed * fading
     return rows + moved * towards[0], columns + moved * towards[1]
+
+
+def other_span(rng: np.random.Generator, plane: Label, rows: Float, columns: Float) -> Places:
+    """Positions that let the right ventricle reach farther about the left one, or less far.
+
+    Around the left ventricle's middle angles are stretched on the right ventricle's side, on
+    either side of its middle by another factor, and shrunk on the other; that fades out beyond the
+    right ventricle. Angles keep their order at every distance: nothing folds.
+    """
+    cut = _short_axis(plane)
+    if cut is None:
+        return rows, columns
+    right, middle, towards, _ = cut
+    across = np.array([-towards[1], towards[0]])
+    pixels = np.argwhere(right) - middle
+    angles = np.arctan2(pixels @ across, pixels @ towards)
+    ends = np.clip(np.percentile(angles, [2, 98]), [-2.6, 0.3], [-0.3, 2.6])
+    farther = np.radians(rng.uniform(-15.0, 45.0, 2)) * (-1, 1)
+    drawn = np.clip(ends + farther, [-2.9, 0.25], [-0.25, 2.9])
+    far = np.percentile(np.linalg.norm(pixels, axis=1), 95)
+    away_rows, away_columns = rows - middle[0], columns - middle[1]
+    away = np.hypot(away_rows, away_columns)
+    angle = np.arctan2(
+        away_rows * across[0] + away_columns * across[1],
+        away_rows * towards[0] + away_columns * towards[1],
+    )
+    knots = [-np.pi, drawn[0], 0.0, drawn[1], np.pi]
+    turned = np.interp(angle, knots, [-np.pi, ends[0], 0.0, ends[1], np.pi])
+    angle += (turned - angle) * np.interp(away, [far, 2 * far], [1.0, 0.0])
+    along, beside = away * np.cos(angle), away * np.sin(angle)
+    return (
+        (middle[0] + along * towards[0] + beside * across[0]).astype(np.float32),
+        (middle[1] + along * towards[1] + beside * across[1]).astype(np.float32),
+    )
+
+
+def _short_axis(plane: Label) -> tuple[Mask, Float, Float, float] | None:
+    """The right ventricle, the left one's middle, the way from that to the right one's, and the
+    left one's radius; None unless the plane cuts the left one across and the right one beside it.
+    """
+    left, right = among(plane, _LEFT), among(plane, _RIGHT)
+    if min(left.sum(), right.sum()) < _LEAST_AREA:
+        return None
+    middle = np.argwhere(left).mean(axis=0)
+    farthest = np.linalg.norm(np.argwhere(left) - middle, axis=1).max()
+    if left.sum() < _LEAST_ROUND * np.pi * farthest**2:
+        return None
+    towards = np.argwhere(right).mean(axis=0) - middle
+    towards /= max(float(np.linalg.norm(towards)), 1e-6)
+    return right, middle, towards, float(np.sqrt(left.sum() / np.pi))

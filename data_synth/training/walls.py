@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.tissue import Tissue
-from data_synth.training.contrast import IN_HEART
+from data_synth.training.contrast import IN_HEART, among
 from data_synth.training.faults import smooth_noise
 
 Label = npt.NDArray[np.uint8]
@@ -40,7 +40,7 @@ def last_ring(planes: Label) -> int | None:
         ``(plane, row, column)`` tissue, the apex first.
     """
     for number in range(len(planes) - 1, -1, -1):
-        inside = np.isin(planes[number], _INSIDE)
+        inside = among(planes[number], _INSIDE)
         if np.count_nonzero(inside) < _LEAST_CAVITY:
             continue
         if closed_ring(planes[number]):
@@ -50,9 +50,9 @@ def last_ring(planes: Label) -> int | None:
 
 def closed_ring(plane: Label) -> bool:
     """Whether a plane shows the left ventricle's cavity, and muscle nearly all around it."""
-    inside = np.isin(plane, _INSIDE)
+    inside = among(plane, _INSIDE)
     around = (cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~inside
-    return bool(inside.any() and np.isin(plane[around], _MUSCLE).mean() >= _CLOSED_SHARE)
+    return bool(inside.any() and among(plane[around], _MUSCLE).mean() >= _CLOSED_SHARE)
 
 
 def long_walled(planes: Label, ring: int, farther: int) -> Label:
@@ -71,14 +71,14 @@ def long_walled(planes: Label, ring: int, farther: int) -> Label:
         Planes by which it goes on.
     """
     longer = planes.copy()
-    ventricle = np.isin(planes[ring], (*_INSIDE, *_MUSCLE))
+    ventricle = among(planes[ring], (*_INSIDE, *_MUSCLE))
     for plane in longer[ring + 1 : ring + 1 + farther]:
         for tissue in (Tissue.LEFT_ATRIUM, Tissue.AORTA):
             body = plane == tissue
             # What would be left of it beside the ring is no atrium and no aorta any more.
             if np.count_nonzero(body & ~ventricle) < 0.6 * np.count_nonzero(body):
                 plane[body] = Tissue.FAT
-        plane[np.isin(plane, (*_INSIDE, *_MUSCLE, Tissue.LEAFLET))] = Tissue.FAT
+        plane[among(plane, (*_INSIDE, *_MUSCLE, Tissue.LEAFLET))] = Tissue.FAT
         plane[ventricle] = planes[ring][ventricle]
     return longer
 
@@ -103,14 +103,14 @@ def thin_walled(planes: Label, layers: int) -> Label:
     thinner = planes.copy()
     for plane in thinner:
         part = plane[top:bottom, left:right]
-        cavity = np.isin(part, _INSIDE).astype(np.uint8)
+        cavity = among(part, _INSIDE).astype(np.uint8)
         free = (part == Tissue.LV_MYOCARDIUM) & (cv2.dilate(cavity, np.ones((5, 5), np.uint8)) == 0)
         for _ in range(layers):
             beside = part.copy()
             for step, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
                 shifted = np.roll(beside, step, axis)
                 outer = free & (part == Tissue.LV_MYOCARDIUM)
-                outer &= ~np.isin(shifted, (*_INSIDE, Tissue.LV_MYOCARDIUM, Tissue.SCAR))
+                outer &= ~among(shifted, (*_INSIDE, Tissue.LV_MYOCARDIUM, Tissue.SCAR))
                 part[outer] = shifted[outer]
     return thinner
 
@@ -130,7 +130,7 @@ def whole_septum(planes: Label) -> Label:
     for plane in whole:
         between = plane == Tissue.RV_WALL
         for beside in ((Tissue.LV_MYOCARDIUM,), (Tissue.RV_CAVITY, Tissue.RV_TRABECULA)):
-            between &= cv2.dilate(np.isin(plane, beside).astype(np.uint8), brush) > 0
+            between &= cv2.dilate(among(plane, beside).astype(np.uint8), brush) > 0
         plane[between] = Tissue.LV_MYOCARDIUM
     return whole
 
@@ -152,7 +152,7 @@ def thick_walled(rng: np.random.Generator, planes: Label, most_px: float = 4.0) 
     grown_px = rng.uniform(-1.0, most_px) + rng.uniform(0.0, 2.5) * uneven
     thicker = planes.copy()
     for plane in thicker:
-        muscle = np.isin(plane, _MUSCLE)
+        muscle = among(plane, _MUSCLE)
         if muscle.any():
             away_px = cv2.distanceTransform((~muscle).astype(np.uint8), cv2.DIST_L2, 3)
             free = ~IN_HEART[plane] | (plane == Tissue.PERICARDIUM)

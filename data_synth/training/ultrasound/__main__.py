@@ -26,11 +26,13 @@ def main(arguments: list[str] | None = None) -> int:
         steps=options.steps,
         minutes=options.minutes,
         batch=options.batch,
+        fresh=options.batch,
         learning_rate=options.learning_rate,
         overlap_weight=(0.3, 0.0),
         start=options.start,
         seed=options.seed,
         threads=options.threads,
+        workers=options.workers,
     )
     recent: list[float] = []
 
@@ -57,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--pool", type=Path, help="folder of hearts; default: pool in --out")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time")
     parser.add_argument("--threads", type=int, default=2, help="threads of the network's own")
-    parser.add_argument("--workers", type=int, default=2, help="processes that fill the pool")
+    parser.add_argument("--workers", type=int, default=2, help="processes that draw")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pool-only", action="store_true", help="fill the pool and stop")
     return parser

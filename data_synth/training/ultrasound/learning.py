@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from data_synth.training.loop import Batch, Report, TrainSettings, learn
+from data_synth.training.loop import Report, TrainSettings, learn
 from data_synth.training.network import UNet
 from data_synth.training.ultrasound.pictures import (
     BLOOD,
@@ -28,6 +28,9 @@ Byte = npt.NDArray[np.uint8]
 
 WIDTHS = (12, 24, 48, 96, 128)
 """Channels at full, half, ... resolution."""
+
+BLOOD_STREAM = 7003
+"""Keeps what is drawn for this network apart from what is drawn for others of the same seed."""
 
 CROP = 128
 """Pixels along each side of the images that are learned from."""
@@ -63,16 +66,7 @@ def draw_sample(rng: np.random.Generator, picture: Picture) -> tuple[Float32, By
     images = normalise(seen, label != OUTSIDE)
     if rng.random() < 0.5:
         images, label = images[..., ::-1], label[:, ::-1]
-    return images, label
-
-
-def draw_batches(pictures: Sequence[Picture], settings: TrainSettings) -> Iterator[Batch]:
-    """Endless batches of ``(n, 2, row, column)`` images and labels; the seed fixes them all."""
-    rng = np.random.default_rng([settings.seed, 7003])
-    while True:
-        picks = rng.integers(len(pictures), size=settings.batch)
-        images, labels = zip(*(draw_sample(rng, pictures[k]) for k in picks), strict=True)
-        yield np.stack(images), np.stack(labels).astype(np.int64)
+    return np.ascontiguousarray(images), np.ascontiguousarray(label)
 
 
 def loss(scores: Any, labels: Any, overlap_weight: float) -> Any:
@@ -92,5 +86,8 @@ def train(
     pictures: Sequence[Picture], settings: TrainSettings, out: Path, report: Report | None = None
 ) -> BloodNet:
     """Train the network, writing ``out/blood.onnx`` and ``out/blood.pt``: see `learn`."""
-    batches = draw_batches(pictures, settings)
-    return learn(BloodNet, batches, loss, settings, out / "blood", report)
+
+    def draw(rng: np.random.Generator) -> tuple[Float32, Byte]:
+        return draw_sample(rng, pictures[int(rng.integers(len(pictures)))])
+
+    return learn(BloodNet, draw, BLOOD_STREAM, loss, settings, out / "blood", report)
