@@ -294,9 +294,9 @@ def test_training_beats_every_constant_answer(blocks):
 
 
 def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
-    once = TrainSettings(steps=1, batch=2, fresh=2)
+    once = TrainSettings(steps=1, batch=2)
     train(list(blocks), once, tmp_path)
-    still = TrainSettings(steps=1, batch=2, fresh=2, learning_rate=0.0, start=tmp_path / "heart.pt")
+    still = TrainSettings(steps=1, batch=2, learning_rate=0.0, start=tmp_path / "heart.pt")
     before = torch.load(tmp_path / "heart.pt", weights_only=True)
     after = train(list(blocks), still, tmp_path / "on").state_dict()
     assert torch.equal(before["head.weight"], after["head.weight"])
@@ -322,38 +322,14 @@ def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
 
 
 def test_command_line_leaves_a_network(tmp_path, capsys):
-    arguments = [
-        "--out",
-        str(tmp_path),
-        "--hearts",
-        "1",
-        "--steps",
-        "1",
-        "--batch",
-        "2",
-        "--fresh",
-        "2",
-    ]
+    short = ["--steps", "1", "--batch", "2"]
+    arguments = ["--out", str(tmp_path), "--hearts", "1", *short]
     assert main([*arguments, "--pool-only"]) == 0
     assert not (tmp_path / "heart.onnx").exists()
     assert main(arguments) == 0
     assert (tmp_path / "heart.onnx").stat().st_size > 1e6
     assert "pool: 1 of 1 hearts" in capsys.readouterr().out
     # Without hearts of its own seed, those of another are learned from.
-    others = [
-        "--hearts",
-        "0",
-        "--seed",
-        "5",
-        "--more",
-        "0",
-        "1",
-        "--steps",
-        "1",
-        "--batch",
-        "2",
-        "--fresh",
-        "2",
-    ]
+    others = ["--hearts", "0", "--seed", "5", "--more", "0", "1", *short]
     assert main(["--out", str(tmp_path / "on"), "--pool", str(tmp_path / "pool"), *others]) == 0
     assert (tmp_path / "on" / "heart.onnx").exists()
