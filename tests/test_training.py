@@ -302,6 +302,14 @@ def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
     assert torch.equal(before["head.weight"], after["head.weight"])
 
 
+def test_fewer_images_kept_than_a_batch_has_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as refused:
+        main(["--out", str(tmp_path / "new"), "--batch", "16", "--kept", "15"])
+    assert refused.value.code == 2
+    assert "--kept: 15 images cannot fill batches of 16" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
     import data_synth.training.pool as pool
 

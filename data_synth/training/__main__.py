@@ -17,7 +17,10 @@ from data_synth.training.render import Parts
 
 def main(arguments: list[str] | None = None) -> int:
     """Fill the pool, train, and leave `heart.onnx` in the folder given by `--out`."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.kept < options.batch:
+        parser.error(f"--kept: {options.kept} images cannot fill batches of {options.batch}")
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
     folder = options.pool or options.out / "pool"
