@@ -26,6 +26,7 @@ from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import clear_apex, favour_right_ventricle
+from pipeline.imaging.plain_blood import settle_plain_blood
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import Orientation, View
 from pipeline.progress import Progress
@@ -121,6 +122,7 @@ def segment_cine(
     _require_ring(seen, found.view)
     confidence = slice_confidence(cine, found, seen)
     _require_understood(seen, confidence, found.view, settings)
+    settle_plain_blood(found, cine)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
     clean_cycle(found.value, found.view.pixel_mm)
     end_at_dark_line(found, cine)

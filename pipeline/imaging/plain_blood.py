@@ -1,0 +1,187 @@
+"""Right ventricle in plain blood of which the network is unsure, told by the blood around it.
+
+Beside a thick or an overloaded left ventricle the right one may reach farther about it than in
+training. There the network's probability fades out along the cavity, though nothing ends in the
+image. So where it is unsure in plain blood, over more than an outline's width, it is averaged along
+ways that cross no edge: a random walk from each pixel ends where the network is sure, and each kind
+of end counts as often as it is met (Grady, "Random walks for image segmentation", IEEE TPAMI
+28:1768-1783, 2006; with priors as in his "Multilabel random walker image segmentation using prior
+models", CVPR 2005). Blood that the network takes for right ventricle stays so.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from pipeline.geometry import Float32, Mask
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.cleanup import THREADS
+from pipeline.imaging.inference import PlaneProbability, sampled_slice
+from pipeline.imaging.labels import LABELS, MUSCLE, most_probable
+
+RIGHT = LABELS["rv_cavity"]
+
+WHOLE_RING = 0.8
+"""Share of a phase's largest cut of muscle that a slice has whose ventricles both lie whole in it:
+nearer the base vessels and atria are plain blood that belongs to none."""
+
+UNSURE, SURE = 0.03, 0.002
+"""Shares of background or ventricle between which a pixel may change, and beyond which it is an
+end of the walk."""
+
+WIDEST_OUTLINE_PX = 5
+"""Across an outline the network is as unsure as it is wide; what is wider is no outline."""
+
+LIKE_BLOOD, FLAT = 0.35, 0.25
+"""Of the ventricle's median grey: how far plain blood is off it, and from one pixel to the next."""
+
+RIM = 0.6
+"""Of the same: pixels brighter than this that touch plain blood are half of it."""
+
+EDGE, LEAST_EDGE = 3.0, 0.02
+"""A difference between two pixels is an edge at three times the usual one, in deviations, or at
+that share of the grey."""
+
+PRIOR, PRIOR_POWER = 0.01, 8
+"""What the network's own opinion of a pixel counts beside one of its neighbours, where it is sure;
+by that power of its certainty elsewhere."""
+
+LEAKAGE = 1e-4
+"""Weight of a way across an edge."""
+
+LEAST_SURE = 20
+"""Pairs of pixels of which greys and their differences can be known."""
+
+
+def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
+    """Give the right ventricle plain blood that goes on from it, in place.
+
+    What was background alone becomes ventricle; a slice tells of its own planes.
+    """
+
+    count = found.planes_a_slice
+    # Greys of a file that was shifted to a mean of 0 are no shares of the blood's.
+    nothing = np.float32(min(float(cine.intensity.min()), 0.0))
+
+    def one(place: tuple[int, int]) -> None:
+        phase, number = place
+        planes = found.value[phase, number * count : (number + 1) * count]
+        _settle_slice(planes, sampled_slice(cine, found.view, phase, number) - nothing)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(one, _whole_slices(found)))
+
+
+def _whole_slices(found: PlaneProbability) -> list[tuple[int, int]]:
+    """Phase and slice, wherever nearly the largest ring of muscle is cut."""
+    whole = []
+    for phase in range(len(found.value)):
+        muscle = (most_probable(found.at_slices(phase)) == MUSCLE).sum(axis=(1, 2))
+        whole += [(phase, int(n)) for n in np.flatnonzero(muscle >= WHOLE_RING * muscle.max())]
+    return whole
+
+
+def _settle_slice(planes: Float32, image: Float32) -> None:
+    """Make more of the planes ``(plane, class, row, column)`` of a slice ventricle, in place."""
+    middle = planes[len(planes) // 2]
+    share = _share(middle)
+    plain, rim, edge = _plain_blood(share, image)
+    unsure = plain & (share > UNSURE) & (share < 1 - UNSURE)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST_OUTLINE_PX, WIDEST_OUTLINE_PX))
+    wide = cv2.morphologyEx(unsure.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    wide = cv2.dilate(wide, np.ones((3, 3), np.uint8))
+    # What is unsure for an outline's sake says nothing about the blood beside it.
+    plain &= ~unsure | (wide > 0)
+    rim |= unsure & (wide == 0)
+    unsure = plain & (wide > 0) & (share > SURE) & (share < 1 - SURE)
+    if not unsure.any():
+        return
+    gain = np.zeros_like(share)
+    gain[unsure] = _logit(walked(share, image / edge, plain, unsure)) - _logit(share[unsure])
+    gain = np.maximum(gain, 0)
+    gain = np.where(rim, cv2.dilate(gain, np.ones((3, 3), np.uint8)), gain)
+    for plane in planes:
+        either = plane[0] + plane[RIGHT]
+        more = 1 / (1 + np.exp(-_logit(_share(plane)) - gain))
+        plane[RIGHT] = np.where(gain > 0, np.minimum(either * more, either), plane[RIGHT])
+        plane[0] = np.where(gain > 0, either - plane[RIGHT], plane[0])
+
+
+def _share(plane: Float32) -> Float32:
+    """Of a plane's ``(class, row, column)`` probabilities: right ventricle's share of it and
+    background, 0 where neither is likely."""
+    either = plane[0] + plane[RIGHT]
+    return np.asarray(np.where(either > 0.5, plane[RIGHT] / np.maximum(either, 0.5), 0), np.float32)
+
+
+def _logit(share: Float32) -> Float32:
+    share = np.clip(share, 1e-4, 1 - 1e-4)
+    return np.asarray(np.log(share / (1 - share)))
+
+
+def _plain_blood(share: Float32, image: Float32) -> tuple[Mask, Mask, float]:
+    """Pixels of blood as the ventricle's, those half of it, and the difference that is an edge.
+
+    None, where too little is surely ventricle.
+    """
+    sure = share > 1 - UNSURE
+    usual = np.concatenate(
+        [np.abs(np.diff(image, axis=axis))[_pairs(sure, axis)] for axis in (0, 1)]
+    )
+    none = np.zeros(share.shape, bool)
+    if len(usual) < LEAST_SURE:
+        return none, none, 1.0
+    grey = float(np.median(image[sure]))
+    brush = np.ones((3, 3), np.uint8)
+    step = np.maximum(cv2.dilate(image, brush) - image, image - cv2.erode(image, brush))
+    plain = (np.abs(image - grey) < LIKE_BLOOD * grey) & (step < FLAT * grey)
+    edge = EDGE * max(1.4826 * float(np.median(usual)), LEAST_EDGE * grey)
+    return plain & (share > 0), ~plain & (image > RIM * grey), edge
+
+
+def _pairs(mask: Mask, axis: int) -> Mask:
+    """Where a pixel and the next along an axis are both in a mask."""
+    first, second = np.moveaxis(mask, axis, 0)[:-1], np.moveaxis(mask, axis, 0)[1:]
+    return np.asarray(np.moveaxis(first & second, 0, axis))
+
+
+def walked(share: Float32, image: Float32, within: Mask, unsure: Mask) -> Float32:
+    """Shares at which walks from unsure pixels end, ``(n,)``, in the order of ``unsure``.
+
+    The solution x of (L + G) x = G p of a graph whose neighbours i and j within the mask are joined
+    by exp(-(I_i - I_j)^2 / 2), L its Laplacian, p and G the network's own shares and how sure it is
+    of them; where it is not unsure, x is p.
+
+    Parameters
+    ----------
+    share
+        ``(row, column)`` in [0, 1].
+    image
+        ``(row, column)``, in units of an edge.
+    within, unsure
+        ``(row, column)``; the second lies in the first.
+    """
+    number = np.cumsum(within).reshape(within.shape) - 1
+    ends, ways = [], []
+    for axis in (0, 1):
+        pairs = _pairs(within, axis)
+        beside = [np.moveaxis(number, axis, 0)[part] for part in (slice(-1), slice(1, None))]
+        ends.append(np.stack([np.moveaxis(one, 0, axis)[pairs] for one in beside]))
+        ways.append(np.exp(-np.square(np.diff(image, axis=axis)[pairs].astype(float)) / 2))
+    first, second = np.concatenate(ends, axis=1)
+    way = np.concatenate(ways) + LEAKAGE
+    both = (np.concatenate([first, second]), np.concatenate([second, first]))
+    count = int(within.sum())
+    graph = sparse.csr_matrix((np.concatenate([way, way]), both), (count, count))
+    laplacian = sparse.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
+    known, asked = share[within].astype(float), unsure[within]
+    prior = PRIOR * np.abs(2 * known[asked] - 1) ** PRIOR_POWER + 1e-6
+    rows = laplacian.tocsr()[asked]
+    matrix = rows[:, asked] + sparse.diags(prior)
+    wanted = prior * known[asked] - rows[:, ~asked] @ known[~asked]
+    return np.asarray(np.clip(spsolve(matrix.tocsc(), wanted), 0, 1), np.float32)
