@@ -302,6 +302,13 @@ def test_training_goes_on_from_a_checkpoint(blocks, tmp_path):
     assert torch.equal(before["head.weight"], after["head.weight"])
 
 
+def test_a_start_that_is_not_there_is_told_before_hearts_are_made(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["--out", str(tmp_path / "new"), "--start", str(tmp_path / "no.pt")])
+    assert "no.pt is no file; give the heart.pt of an earlier run" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_fewer_images_kept_than_a_batch_has_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as refused:
         main(["--out", str(tmp_path / "new"), "--batch", "16", "--kept", "15"])

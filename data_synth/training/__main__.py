@@ -21,6 +21,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.kept < options.batch:
         parser.error(f"--kept: {options.kept} images cannot fill batches of {options.batch}")
+    # Before hearts are made, which takes most of an hour.
+    if options.start is not None and not options.start.is_file():
+        parser.error(f"--start: {options.start} is no file; give the heart.pt of an earlier run")
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
     folder = options.pool or options.out / "pool"
