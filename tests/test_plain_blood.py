@@ -13,6 +13,7 @@ from pipeline.imaging.view import view_of
 
 SIDE, PIXEL_MM = 96, 1.5
 CAVITY, MUSCLE, RIGHT = (LABELS[name] for name in ("lv_cavity", "lv_myocardium", "rv_cavity"))
+LEFT_ATRIUM, RIGHT_ATRIUM = LABELS["left_atrium"], LABELS["right_atrium"]
 BLOOD, WALL, LUNG = 1.0, 0.35, 0.08
 ROWS, COLUMNS = np.indices((SIDE, SIDE)) - (SIDE - 1) / 2
 AWAY, ANGLE = np.hypot(ROWS, COLUMNS), np.degrees(np.arctan2(ROWS, -COLUMNS))
@@ -46,8 +47,8 @@ def test_a_walk_does_not_cross_an_edge():
     assert expected[7] > 0.99
 
 
-def study(slices=3, fades=True, beyond=None, noise=0.02, seed=1):
-    """A ring of muscle with a crescent of right ventricle, of which the network sees one end.
+def study(slices=3, fades=True, beyond=None, noise=0.02, seed=1, chamber=RIGHT):
+    """A ring of muscle with a crescent of a chamber, of which the network sees one end.
 
     ``beyond``: grey of what lies beyond 35 degrees instead of blood.
     """
@@ -56,9 +57,9 @@ def study(slices=3, fades=True, beyond=None, noise=0.02, seed=1):
         image[CRESCENT & (ANGLE > 35)] = beyond
     chance = np.zeros((1 + len(LABELS), SIDE, SIDE), np.float32)
     certainty = np.interp(ANGLE, [0, 70], [1, 0.15 if fades else 1])
-    chance[RIGHT] = np.where(CRESCENT, 0.999 * certainty, 0.001)
+    chance[chamber] = np.where(CRESCENT, 0.999 * certainty, 0.001)
     chance[CAVITY], chance[MUSCLE] = AWAY < 12, (AWAY >= 12) & (AWAY < 25)
-    chance[RIGHT] *= AWAY >= 25
+    chance[chamber] *= AWAY >= 25
     chance[0] = 1 - chance[1:].sum(axis=0)
     picture = image + noise * np.random.default_rng(seed).standard_normal((slices, SIDE, SIDE))
     frame = np.diag([PIXEL_MM, PIXEL_MM, 10.0, 1.0])
@@ -67,17 +68,18 @@ def study(slices=3, fades=True, beyond=None, noise=0.02, seed=1):
     return PlaneProbability(value, view_of(cine), 3), cine
 
 
-def right_dice(planes):
-    """Dice of the right ventricle on each plane with the crescent."""
-    drawn = most_probable(planes) == RIGHT
+def dice(planes, chamber=RIGHT):
+    """Dice of the chamber on each plane with the crescent."""
+    drawn = most_probable(planes) == chamber
     return 2 * (drawn & CRESCENT).sum(axis=(1, 2)) / (drawn.sum(axis=(1, 2)) + CRESCENT.sum())
 
 
-def test_a_ventricle_goes_on_to_where_its_blood_ends():
-    found, cine = study()
-    assert right_dice(found.value[0]).max() < 0.9
+@pytest.mark.parametrize("chamber", [RIGHT, LEFT_ATRIUM, RIGHT_ATRIUM])
+def test_a_chamber_goes_on_to_where_its_blood_ends(chamber):
+    found, cine = study(chamber=chamber)
+    assert dice(found.value[0], chamber).max() < 0.9
     settle_plain_blood(found, cine)
-    assert right_dice(found.value[0]).min() > 0.97
+    assert dice(found.value[0], chamber).min() > 0.97
 
 
 def test_greys_shifted_below_zero_change_nothing():
@@ -86,7 +88,7 @@ def test_greys_shifted_below_zero_change_nothing():
     low = Cine(other.intensity - other.intensity.mean(), other.mr_from_index, other.phases, 1.0)
     settle_plain_blood(found, cine)
     settle_plain_blood(shifted, low)
-    assert right_dice(shifted.value[0]) == pytest.approx(right_dice(found.value[0]), abs=0.01)
+    assert dice(shifted.value[0]) == pytest.approx(dice(found.value[0]), abs=0.01)
 
 
 @pytest.mark.parametrize("beyond", [LUNG, WALL, 2.2])
@@ -108,29 +110,30 @@ def test_an_outline_that_is_merely_soft_stays():
     assert (found.value == before).all()
 
 
-def test_slices_without_a_whole_ring_of_muscle_stay():
-    found, cine = study()
-    # The last slice cuts half of the muscle: what is muscle there becomes atrium.
+@pytest.mark.parametrize("chamber", [RIGHT, LEFT_ATRIUM])
+def test_where_the_ring_of_muscle_is_not_whole_ventricles_stay(chamber):
+    found, cine = study(chamber=chamber)
+    # The last slice cuts half of the muscle; the other half is aorta there.
     half = (AWAY >= 12) & (AWAY < 25) & (ROWS > 0)
     for plane in found.value[0, 6:]:
-        plane[LABELS["left_atrium"]][half], plane[MUSCLE][half] = 1, 0
+        plane[LABELS["aorta"]][half], plane[MUSCLE][half] = 1, 0
     before = found.value.copy()
     settle_plain_blood(found, cine)
-    assert (found.value[0, 6:] == before[0, 6:]).all()
-    assert (found.value[0, :6] != before[0, :6]).any()
+    changed = (found.value[0] != before[0]).any(axis=(1, 2, 3))
+    assert changed.tolist() == [True] * 6 + [chamber != RIGHT] * 3
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.sampled_from([0.0, 0.02, 0.1]))
-def test_only_background_becomes_right_ventricle(seed, noise):
+def test_only_background_becomes_chamber(seed, noise):
     found, cine = study(slices=2, noise=noise, seed=seed)
     rng = np.random.default_rng(seed)
     found.value[:] *= rng.uniform(0.3, 1.0, found.value.shape)
     found.value[:] /= found.value.sum(axis=2, keepdims=True)
     before = found.value.copy()
     settle_plain_blood(found, cine)
-    others = [k for k in range(1 + len(LABELS)) if k not in (0, RIGHT)]
+    others, chambers = [CAVITY, MUSCLE, LABELS["aorta"]], [RIGHT, LEFT_ATRIUM, RIGHT_ATRIUM]
     assert (found.value[:, :, others] == before[:, :, others]).all()
-    assert (found.value[:, :, RIGHT] >= before[:, :, RIGHT] - 1e-6).all()
+    assert (found.value[:, :, chambers] >= before[:, :, chambers] - 1e-6).all()
     assert found.value.sum(axis=2) == pytest.approx(before.sum(axis=2), abs=1e-5)
     assert found.value.min() >= 0

@@ -1,12 +1,12 @@
-"""Right ventricle in plain blood of which the network is unsure, told by the blood around it.
+"""Plain blood of which the network is unsure, told by the blood around it.
 
 Beside a thick or an overloaded left ventricle the right one may reach farther about it than in
-training. There the network's probability fades out along the cavity, though nothing ends in the
-image. So where it is unsure in plain blood, over more than an outline's width, it is averaged along
-ways that cross no edge: a random walk from each pixel ends where the network is sure, and each kind
-of end counts as often as it is met (Grady, "Random walks for image segmentation", IEEE TPAMI
-28:1768-1783, 2006; with priors as in his "Multilabel random walker image segmentation using prior
-models", CVPR 2005). Blood that the network takes for right ventricle stays so.
+training, and atria may be larger. There the network's probability fades out within the chamber,
+though nothing ends in the image. So where it is unsure in plain blood, over more than an outline's
+width, it is averaged along ways that cross no edge: a random walk from each pixel ends where the
+network is sure, and each kind of end counts as often as it is met (Grady, "Random walks for image
+segmentation", IEEE TPAMI 28:1768-1783, 2006; with priors as in his "Multilabel random walker image
+segmentation using prior models", CVPR 2005). What the network takes for a chamber stays so.
 """
 
 from __future__ import annotations
@@ -25,20 +25,24 @@ from pipeline.imaging.inference import PlaneProbability, sampled_slice
 from pipeline.imaging.labels import LABELS, MUSCLE, most_probable
 
 RIGHT = LABELS["rv_cavity"]
+CHAMBERS = (RIGHT, LABELS["left_atrium"], LABELS["right_atrium"])
+
+LIKELY = 0.5
+"""A pixel is a chamber or background if it is so with this probability."""
 
 WHOLE_RING = 0.8
-"""Share of a phase's largest cut of muscle that a slice has whose ventricles both lie whole in it:
-nearer the base vessels and atria are plain blood that belongs to none."""
+"""Share of a phase's largest cut of muscle that a slice has in which a right ventricle may go on:
+nearer the base vessels and atria are plain blood beside it."""
 
 UNSURE, SURE = 0.03, 0.002
-"""Shares of background or ventricle between which a pixel may change, and beyond which it is an
+"""Shares of background or chamber between which a pixel may change, and beyond which it is an
 end of the walk."""
 
 WIDEST_OUTLINE_PX = 5
 """Across an outline the network is as unsure as it is wide; what is wider is no outline."""
 
 LIKE_BLOOD, FLAT = 0.35, 0.25
-"""Of the ventricle's median grey: how far plain blood is off it, and from one pixel to the next."""
+"""Of the chamber's median grey: how far plain blood is off it, and from one pixel to the next."""
 
 RIM = 0.6
 """Of the same: pixels brighter than this that touch plain blood are half of it."""
@@ -59,46 +63,65 @@ LEAST_SURE = 20
 
 
 def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
-    """Give the right ventricle plain blood that goes on from it, in place.
+    """Give the right ventricle and the atria plain blood that goes on from them, in place.
 
-    What was background alone becomes ventricle; a slice tells of its own planes.
+    What was background alone becomes chamber; a slice tells of its own planes.
     """
 
     count = found.planes_a_slice
     # Greys of a file that was shifted to a mean of 0 are no shares of the blood's.
     nothing = np.float32(min(float(cine.intensity.min()), 0.0))
 
+    whole = _whole_slices(found)
+
     def one(place: tuple[int, int]) -> None:
         phase, number = place
         planes = found.value[phase, number * count : (number + 1) * count]
-        _settle_slice(planes, sampled_slice(cine, found.view, phase, number) - nothing)
+        chambers = [
+            chamber
+            for chamber in CHAMBERS
+            if (chamber != RIGHT or whole[place]) and _wide(_unsure(planes, chamber)).any()
+        ]
+        if chambers:
+            image = sampled_slice(cine, found.view, phase, number) - nothing
+            for chamber in chambers:
+                _settle_slice(planes, chamber, image)
 
     with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(one, _whole_slices(found)))
+        list(pool.map(one, np.ndindex(whole.shape)))
 
 
-def _whole_slices(found: PlaneProbability) -> list[tuple[int, int]]:
-    """Phase and slice, wherever nearly the largest ring of muscle is cut."""
-    whole = []
-    for phase in range(len(found.value)):
-        muscle = (most_probable(found.at_slices(phase)) == MUSCLE).sum(axis=(1, 2))
-        whole += [(phase, int(n)) for n in np.flatnonzero(muscle >= WHOLE_RING * muscle.max())]
-    return whole
+def _whole_slices(found: PlaneProbability) -> Mask:
+    """Where nearly the largest ring of muscle of its phase is cut, ``(phase, slice)``."""
+    cuts = [
+        (most_probable(found.at_slices(phase)) == MUSCLE).sum(axis=(1, 2))
+        for phase in range(len(found.value))
+    ]
+    return np.asarray(np.array(cuts) >= WHOLE_RING * np.max(cuts, axis=1, keepdims=True))
 
 
-def _settle_slice(planes: Float32, image: Float32) -> None:
-    """Make more of the planes ``(plane, class, row, column)`` of a slice ventricle, in place."""
-    middle = planes[len(planes) // 2]
-    share = _share(middle)
-    plain, rim, edge = _plain_blood(share, image)
-    unsure = plain & (share > UNSURE) & (share < 1 - UNSURE)
+def _unsure(planes: Float32, chamber: int) -> Mask:
+    """Pixels of a slice that may be chamber or background."""
+    share = _share(planes[len(planes) // 2], chamber)
+    return np.asarray((share > UNSURE) & (share < 1 - UNSURE))
+
+
+def _wide(mask: Mask) -> Mask:
+    """The parts of a mask that are wider than an outline."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST_OUTLINE_PX, WIDEST_OUTLINE_PX))
-    wide = cv2.morphologyEx(unsure.astype(np.uint8), cv2.MORPH_OPEN, disc)
-    wide = cv2.dilate(wide, np.ones((3, 3), np.uint8))
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0)
+
+
+def _settle_slice(planes: Float32, chamber: int, image: Float32) -> None:
+    """Make more of the planes ``(plane, class, row, column)`` of a slice chamber, in place."""
+    share = _share(planes[len(planes) // 2], chamber)
+    plain, rim, edge = _plain_blood(share, image)
+    unsure = plain & _unsure(planes, chamber)
+    wide = cv2.dilate(_wide(unsure).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     # What is unsure for an outline's sake says nothing about the blood beside it.
-    plain &= ~unsure | (wide > 0)
-    rim |= unsure & (wide == 0)
-    unsure = plain & (wide > 0) & (share > SURE) & (share < 1 - SURE)
+    plain &= ~unsure | wide
+    rim |= unsure & ~wide
+    unsure = plain & wide & (share > SURE) & (share < 1 - SURE)
     if not unsure.any():
         return
     gain = np.zeros_like(share)
@@ -106,17 +129,18 @@ def _settle_slice(planes: Float32, image: Float32) -> None:
     gain = np.maximum(gain, 0)
     gain = np.where(rim, cv2.dilate(gain, np.ones((3, 3), np.uint8)), gain)
     for plane in planes:
-        either = plane[0] + plane[RIGHT]
-        more = 1 / (1 + np.exp(-_logit(_share(plane)) - gain))
-        plane[RIGHT] = np.where(gain > 0, np.minimum(either * more, either), plane[RIGHT])
-        plane[0] = np.where(gain > 0, either - plane[RIGHT], plane[0])
+        either = plane[0] + plane[chamber]
+        more = 1 / (1 + np.exp(-_logit(_share(plane, chamber)) - gain))
+        plane[chamber] = np.where(gain > 0, np.minimum(either * more, either), plane[chamber])
+        plane[0] = np.where(gain > 0, either - plane[chamber], plane[0])
 
 
-def _share(plane: Float32) -> Float32:
-    """Of a plane's ``(class, row, column)`` probabilities: right ventricle's share of it and
-    background, 0 where neither is likely."""
-    either = plane[0] + plane[RIGHT]
-    return np.asarray(np.where(either > 0.5, plane[RIGHT] / np.maximum(either, 0.5), 0), np.float32)
+def _share(plane: Float32, chamber: int) -> Float32:
+    """Of a plane's ``(class, row, column)`` probabilities: a chamber's share of it and background,
+    0 where neither is likely."""
+    either = plane[0] + plane[chamber]
+    share = plane[chamber] / np.maximum(either, LIKELY)
+    return np.asarray(np.where(either > LIKELY, share, 0), np.float32)
 
 
 def _logit(share: Float32) -> Float32:
@@ -125,9 +149,9 @@ def _logit(share: Float32) -> Float32:
 
 
 def _plain_blood(share: Float32, image: Float32) -> tuple[Mask, Mask, float]:
-    """Pixels of blood as the ventricle's, those half of it, and the difference that is an edge.
+    """Pixels of blood as the chamber's, those half of it, and the difference that is an edge.
 
-    None, where too little is surely ventricle.
+    None, where too little is surely chamber.
     """
     sure = share > 1 - UNSURE
     usual = np.concatenate(
