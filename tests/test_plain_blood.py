@@ -13,7 +13,7 @@ from pipeline.imaging.view import view_of
 
 SIDE, PIXEL_MM = 96, 1.5
 CAVITY, MUSCLE, RIGHT = (LABELS[name] for name in ("lv_cavity", "lv_myocardium", "rv_cavity"))
-LEFT_ATRIUM, RIGHT_ATRIUM = LABELS["left_atrium"], LABELS["right_atrium"]
+LEFT_ATRIUM = LABELS["left_atrium"]
 BLOOD, WALL, LUNG = 1.0, 0.35, 0.08
 ROWS, COLUMNS = np.indices((SIDE, SIDE)) - (SIDE - 1) / 2
 AWAY, ANGLE = np.hypot(ROWS, COLUMNS), np.degrees(np.arctan2(ROWS, -COLUMNS))
@@ -74,7 +74,7 @@ def dice(planes, chamber=RIGHT):
     return 2 * (drawn & CRESCENT).sum(axis=(1, 2)) / (drawn.sum(axis=(1, 2)) + CRESCENT.sum())
 
 
-@pytest.mark.parametrize("chamber", [RIGHT, LEFT_ATRIUM, RIGHT_ATRIUM])
+@pytest.mark.parametrize("chamber", [RIGHT, LEFT_ATRIUM])
 def test_a_chamber_goes_on_to_where_its_blood_ends(chamber):
     found, cine = study(chamber=chamber)
     assert dice(found.value[0], chamber).max() < 0.9
@@ -132,7 +132,8 @@ def test_only_background_becomes_chamber(seed, noise):
     found.value[:] /= found.value.sum(axis=2, keepdims=True)
     before = found.value.copy()
     settle_plain_blood(found, cine)
-    others, chambers = [CAVITY, MUSCLE, LABELS["aorta"]], [RIGHT, LEFT_ATRIUM, RIGHT_ATRIUM]
+    chambers = [RIGHT, LEFT_ATRIUM]
+    others = [k for k in range(1 + len(LABELS)) if k not in (0, *chambers)]
     assert (found.value[:, :, others] == before[:, :, others]).all()
     assert (found.value[:, :, chambers] >= before[:, :, chambers] - 1e-6).all()
     assert found.value.sum(axis=2) == pytest.approx(before.sum(axis=2), abs=1e-5)

@@ -1,12 +1,13 @@
 """Plain blood of which the network is unsure, told by the blood around it.
 
 Beside a thick or an overloaded left ventricle the right one may reach farther about it than in
-training, and atria may be larger. There the network's probability fades out within the chamber,
-though nothing ends in the image. So where it is unsure in plain blood, over more than an outline's
-width, it is averaged along ways that cross no edge: a random walk from each pixel ends where the
-network is sure, and each kind of end counts as often as it is met (Grady, "Random walks for image
-segmentation", IEEE TPAMI 28:1768-1783, 2006; with priors as in his "Multilabel random walker image
-segmentation using prior models", CVPR 2005). What the network takes for a chamber stays so.
+training, and left atria may be larger. There the network's probability fades out within the
+chamber, though nothing ends in the image. So where it is unsure in plain blood, over more than an
+outline's width, it is averaged along ways that cross no edge: a random walk from each pixel ends
+where the network is sure, and each kind of end counts as often as it is met (Grady, "Random walks
+for image segmentation", IEEE TPAMI 28:1768-1783, 2006; with priors as in his "Multilabel random
+walker image segmentation using prior models", CVPR 2005). What the network takes for a chamber
+stays so.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from pipeline.imaging.inference import PlaneProbability, sampled_slice
 from pipeline.imaging.labels import LABELS, MUSCLE, most_probable
 
 RIGHT = LABELS["rv_cavity"]
-CHAMBERS = (RIGHT, LABELS["left_atrium"], LABELS["right_atrium"])
+CHAMBERS = (RIGHT, LABELS["left_atrium"])
+"""Not the right atrium: venae cavae as wide as it open into it, and no edge parts them."""
 
 LIKELY = 0.5
 """A pixel is a chamber or background if it is so with this probability."""
@@ -63,7 +65,7 @@ LEAST_SURE = 20
 
 
 def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
-    """Give the right ventricle and the atria plain blood that goes on from them, in place.
+    """Give the right ventricle and the left atrium plain blood that goes on from them, in place.
 
     What was background alone becomes chamber; a slice tells of its own planes.
     """
