@@ -69,11 +69,9 @@ def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
 
     What was background alone becomes chamber; a slice tells of its own planes.
     """
-
     count = found.planes_a_slice
     # Greys of a file that was shifted to a mean of 0 are no shares of the blood's.
     nothing = np.float32(min(float(cine.intensity.min()), 0.0))
-
     whole = _whole_slices(found)
 
     def one(place: tuple[int, int]) -> None:
@@ -133,7 +131,8 @@ def _settle_slice(planes: Float32, chamber: int, image: Float32) -> None:
     for plane in planes:
         either = plane[0] + plane[chamber]
         more = 1 / (1 + np.exp(-_logit(_share(plane, chamber)) - gain))
-        plane[chamber] = np.where(gain > 0, np.minimum(either * more, either), plane[chamber])
+        larger = np.clip(either * more, plane[chamber], either)
+        plane[chamber] = np.where(gain > 0, larger, plane[chamber])
         plane[0] = np.where(gain > 0, either - plane[chamber], plane[0])
 
 
