@@ -18,6 +18,7 @@ import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Mask
+from pipeline.imaging.network import read_onnx
 from pipeline.registration.contact import Contact
 from pipeline.registration.frames import (
     BloodSweep,
@@ -53,7 +54,7 @@ def load_network() -> Any:
         When the weights that come with the package are missing or cannot be read.
     """
     try:
-        return cv2.dnn.readNetFromONNX(str(WEIGHTS))
+        return read_onnx(WEIGHTS)
     except cv2.error as error:
         raise StageError(
             f"{WEIGHTS}: the weights that read ultrasound cannot be read ({error}); install the "
