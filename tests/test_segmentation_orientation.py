@@ -11,7 +11,7 @@ from data_synth.mr import MrSettings, acquire_cine
 from data_synth.population import draw_heart
 from pipeline.imaging import inference, orientation, view
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.inference import TURNS_DEG, count_turns
+from pipeline.imaging.inference import TURNS_DEG, count_turns, turns_deg
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.locating import (
     FIELD_MM,
@@ -229,11 +229,21 @@ def test_what_lies_outside_the_image_does_not_change_its_grey_values():
     )
 
 
-@pytest.mark.parametrize(("images", "ways"), [(24, 5), (300, 2), (600, 1), (5000, 1)])
+@pytest.mark.parametrize(("images", "ways"), [(24, 5), (300, 3), (400, 2), (5000, 1)])
 def test_the_fewer_images_the_more_ways_they_are_shown(images, ways):
     assert count_turns(images, 5) == ways
     assert count_turns(images, 1) == 1
     assert len(TURNS_DEG) == len(set(TURNS_DEG)) == 5
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_neighbours_in_time_are_seen_turned_the_other_way(count):
+    first, second, third = (turns_deg(phase, count) for phase in range(3))
+    assert len(set(first)) == count
+    assert first == third
+    assert sum(first) == -sum(second)
+    others = {10.0, -10.0, 20.0, -20.0}
+    assert set(first) | set(second) == (others if count == 2 else {0.0, *others})
 
 
 @pytest.fixture(scope="module")

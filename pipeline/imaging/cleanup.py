@@ -151,22 +151,33 @@ def _bounding_box(labels: Label) -> tuple[slice, slice, slice] | None:
 
 def _largest_body(mask: Mask) -> Mask:
     """The largest part and all that lies within `NECK` of it; the mask itself when empty."""
+    found = ndimage.find_objects(mask.view(np.uint8))
+    if not found:
+        return mask
+    # Parts that are bridged beyond this box are bridged within it too.
+    inside = mask[found[0]]
     # An auricle's neck may pass between two planes, or be thinner than the pixels.
-    bridged = ndimage.binary_dilation(mask, np.ones((1, *NECK), bool))
+    bridged = ndimage.binary_dilation(inside, np.ones((1, *NECK), bool))
     parts, count = ndimage.label(bridged, np.ones((3, 3, 3), bool))
     if count < 2:
         return mask
-    parts *= mask
+    parts *= inside
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return np.asarray(parts == sizes.argmax())
+    largest = np.zeros_like(mask)
+    largest[found[0]] = parts == sizes.argmax()
+    return largest
 
 
 def _keep_bodies(part: Float32) -> None:
     """Take every structure's probability outside its largest body, in place."""
+    labels = most_probable(part)
     for value in LABELS.values():
-        mask = most_probable(part) == value
-        part[:, value] *= ~(mask & ~_largest_body(mask))
+        mask = labels == value
+        beside = mask & ~_largest_body(mask)
+        if beside.any():
+            part[:, value] *= ~beside
+            labels[beside] = part.transpose(0, 2, 3, 1)[beside].argmax(axis=-1)
 
 
 def _keep_ringed(part: Float32) -> None:

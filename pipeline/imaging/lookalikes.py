@@ -132,9 +132,13 @@ def _discs(plane: Mask, pixel_mm: float) -> list[Mask]:
     from skimage.morphology import h_maxima
     from skimage.segmentation import watershed
 
-    if not plane.any():
+    found = ndimage.find_objects(plane.view(np.uint8))
+    if not found:
         return []
-    depth = cv2.distanceTransform(plane.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # With a rim of background, where the plane has one.
+    box = tuple(slice(max(0, side.start - 1), side.stop + 1) for side in found[0])
+    depth = cv2.distanceTransform(plane[box].astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
-    parts = watershed(-depth, middles, mask=plane)
+    parts = np.zeros(plane.shape, np.int32)
+    parts[box] = watershed(-depth, middles, mask=plane[box])
     return [parts == number for number in range(1, count + 1)]
