@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.imaging.inference import blend_phases
+from pipeline.imaging.inference import blend_phases, settle_tricuspid
+from pipeline.imaging.labels import LABELS, MUSCLE
 
 
 @pytest.mark.parametrize(("count", "share"), [(25, 0.25), (8, 0.1), (3, 0.2), (2, 0.25)])
@@ -35,3 +38,53 @@ def test_blending_leaves_no_probability_below_nothing():
     value[0] = 1
     blend_phases(value, 0.25)
     np.testing.assert_allclose(value.ravel(), [0.625, 0.25, 0, 0, 0, 0.25], atol=1e-7)
+
+
+RIGHT = [LABELS["right_atrium"], LABELS["rv_cavity"]]
+
+
+def _right_heart(of_atrium):
+    """``(phase, 1, 7, 1, place)``: whose blood each place is in each phase, little is muscle."""
+    share = np.where(of_atrium, 0.9, 0.05).astype(np.float32)
+    value = np.zeros((len(share), 1, 7, 1, share.shape[1]), np.float32)
+    value[:, 0, RIGHT[0], 0], value[:, 0, RIGHT[1], 0] = share, np.float32(0.95) - share
+    value[:, 0, MUSCLE] = 0.05
+    return value
+
+
+@given(
+    phases=st.integers(12, 60),
+    starts=st.lists(st.integers(0, 59), min_size=1, max_size=8),
+    data=st.data(),
+)
+def test_the_right_atrium_reaches_a_place_for_longer_than_a_twelfth_of_the_beat_or_not_at_all(
+    phases, starts, data
+):
+    reach = phases // 12
+    phase = np.arange(phases)[:, None]
+    last = np.array([data.draw(st.integers(reach + 1, phases)) for _ in starts])
+    long = (phase - starts) % phases < last
+    brief = (phase - starts) % phases < data.draw(st.integers(1, reach))
+    # The ventricle may come for a moment: at end-diastole it is largest for no longer.
+    for of_atrium, expected in ((long, long), (brief, brief & False), (~brief, ~brief)):
+        value = _right_heart(of_atrium)
+        settle_tricuspid(value)
+        np.testing.assert_allclose(value, _right_heart(expected), atol=1e-6)
+
+
+def test_the_right_ventricle_takes_from_its_atrium_alone_and_never_gives():
+    rng = np.random.default_rng(3)
+    value = rng.dirichlet(np.full(7, 0.3), (24, 2, 5, 6)).astype(np.float32)
+    value = value.transpose(0, 1, 4, 2, 3).copy()
+    before, few = value.copy(), value[:11].copy()
+    settle_tricuspid(value)
+    settle_tricuspid(few)
+    np.testing.assert_array_equal(few, before[:11])
+    others = [k for k in range(7) if k not in RIGHT]
+    np.testing.assert_array_equal(value[:, :, others], before[:, :, others])
+    gained = value - before
+    assert (gained[:, :, RIGHT[1]] >= 0).all()
+    assert (gained[:, :, RIGHT[1]] > 0).any()
+    np.testing.assert_allclose(gained[:, :, RIGHT].sum(axis=2), 0, atol=1e-6)
+    elsewhere = before[:, :, RIGHT].sum(axis=2) < 0.5
+    assert not gained[:, :, RIGHT[1]][elsewhere].any()

@@ -20,6 +20,7 @@ from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
     label_probability,
+    settle_tricuspid,
 )
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS, most_probable
@@ -123,6 +124,7 @@ def segment_cine(
     confidence = slice_confidence(cine, found, seen)
     _require_understood(seen, confidence, found.view, settings)
     settle_plain_blood(found, cine)
+    settle_tricuspid(found.value)
     blend_phases(found.value, settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2))
     clean_cycle(found.value, found.view.pixel_mm)
     end_at_dark_line(found, cine)
