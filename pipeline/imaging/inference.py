@@ -190,7 +190,8 @@ def settle_tricuspid(value: Float32) -> None:
         return
     around = np.arange(len(value)) + np.arange(-reach, reach + 1)[:, None]
     pair = [LABELS["right_atrium"], LABELS["rv_cavity"]]
-    passed = value[:, :, pair].max(axis=0).min(axis=1) > LEAST_PASSED
+    ever = [value[:, :, k].max(axis=0) for k in pair]
+    passed = np.minimum(*ever) > LEAST_PASSED
     for plane in np.flatnonzero(passed.any(axis=(1, 2))):
         rows, columns = np.nonzero(passed[plane])
         atrium, ventricle = (value[:, plane, k][:, rows, columns] for k in pair)
