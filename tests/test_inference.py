@@ -1,12 +1,15 @@
-"""Phases mixed with their neighbours: what is kept and what goes."""
+"""The network by either engine; phases mixed with their neighbours: what is kept and what goes."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.imaging import network
 from pipeline.imaging.inference import blend_phases, settle_tricuspid
 from pipeline.imaging.labels import LABELS, MUSCLE
+from pipeline.imaging.network import WEIGHTS, predict, read_onnx
 
 
 @pytest.mark.parametrize(("count", "share"), [(25, 0.25), (8, 0.1), (3, 0.2), (2, 0.25)])
@@ -88,3 +91,14 @@ def test_the_right_ventricle_takes_from_its_atrium_alone_and_never_gives():
     np.testing.assert_allclose(gained[:, :, RIGHT].sum(axis=2), 0, atol=1e-6)
     elsewhere = before[:, :, RIGHT].sum(axis=2) < 0.5
     assert not gained[:, :, RIGHT[1]][elsewhere].any()
+
+
+def test_the_network_says_the_same_where_opencv_has_no_classic_engine(monkeypatch):
+    """The newer engine shares no convolution with the classic one."""
+    images = np.random.default_rng(4).uniform(0, 1, (3, 3, 64, 96)).astype(np.float32)
+    found = predict(images)
+    monkeypatch.delattr(cv2.dnn, "ENGINE_CLASSIC", raising=False)
+    newer = read_onnx(WEIGHTS)
+    monkeypatch.setattr(network, "load_network", lambda: newer)
+    # Single precision, some 20 layers deep with sums of up to 2448 terms; Winograd's rounds more.
+    np.testing.assert_allclose(predict(images), found, atol=1e-3)
