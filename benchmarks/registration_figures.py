@@ -3,6 +3,7 @@
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--phases 20]
         [--peer 20] [--global 0] [--calibration-error MM DEG] [--mr-pixels 1] [--reading grey]
+        [--frames 48,24,40,12,48,32,16]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
 lost and level of noise, and registered from starts of up to 20 mm and 20 degrees off.
@@ -12,8 +13,8 @@ in the cine, and to the cine itself, rather than to the phantom's own meshes at 
 of the beat. ``--peer N`` runs SimpleITK's mutual information beside it on the first N studies,
 ``--global N`` registers the first N without any start. ``--calibration-error MM DEG`` puts the
 pictures of each sweep so far beside their place, and registers with ``calibration: per_sweep`` too
-(0 0: right). ``--mr-pixels 1.05`` tells larger pixels of the cine. What OUT/results.jsonl holds,
-line by line, is not done again.
+(0 0: right). ``--frames`` are the frames of the studies, in turn. ``--mr-pixels 1.05`` tells larger
+pixels of the cine. What OUT/results.jsonl holds, line by line, is not done again.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from typing import Any
 import numpy as np
 from registration_peer import compounded, mr_volume, mutual_information
 from registration_studies import (
+    RECORDED,
+    SWEEPS,
     Order,
     Study,
     found_surfaces,
@@ -51,7 +54,7 @@ from pipeline.registration.space import find
 from pipeline.registration.uncertainty import motion_between
 from pipeline.registration.verdict import Evidence, judge
 
-FRAMES = (48, 24, 40, 12, 48, 32, 16)
+FRAMES = "48,24,40,12,48,32,16"
 DROPOUT = (0.0, 0.2, 0.0, 0.4, 0.6)
 SNR_DB = (None, 20.0, 10.0)
 CAPTURED_MM = 2.0
@@ -68,15 +71,17 @@ def orders(arguments: argparse.Namespace) -> Iterator[Order]:
     if arguments.surfaces != "truth":
         names = [one.name.split("-", 1) for one in Path(arguments.surfaces).iterdir()]
         hearts = sorted((int(seed), illness) for seed, illness in names)[: arguments.hearts]
+    frames = [int(count) for count in arguments.frames.split(",")]
     examined = ((heart, probe) for heart in hearts for probe in arguments.probes.split(","))
     for k, ((seed, illness), probe) in enumerate(examined):
         yield Order(
             seed=seed,
             pathology=illness,
             probe=probe,
-            frames=FRAMES[k % len(FRAMES)],
+            frames=frames[k % len(frames)],
             dropout=DROPOUT[k % len(DROPOUT)],
             snr_db=SNR_DB[(k // 2) % len(SNR_DB)],
+            recorded=max(RECORDED, -(-max(frames) // SWEEPS)),
         )
 
 
@@ -266,8 +271,8 @@ def tables(results: list[dict[str, Any]]) -> str:
         text.append(line("beatfield, the same as SimpleITK MI", same))
     for key in ("share", "probe", "frames", "dropout", "snr_db", "pathology"):
         text += ["", f"By {key}:", "", HEAD]
-        for value in sorted({str(one[key]) for one in ours}):
-            text.append(line(value, [one for one in ours if str(one[key]) == value]))
+        for value in sorted({one[key] for one in ours}, key=_rank):
+            text.append(line(str(value), [one for one in ours if one[key] == value]))
     text += ["", *calibration(ours)]
     corrected = [one for one in results if one["method"] == "per_sweep"]
     if corrected:
@@ -276,6 +281,11 @@ def tables(results: list[dict[str, Any]]) -> str:
             text.append(line(probe, [one for one in corrected if one["probe"] == probe]))
         text += ["", *calibration(corrected)]
     return "\n".join(text)
+
+
+def _rank(value: float | str | None) -> tuple[float, str]:
+    """Sorts numbers by size, after none, and names by letter."""
+    return (value, "") if isinstance(value, (int, float)) else (-np.inf, str(value or ""))
 
 
 def calibration(results: list[dict[str, Any]]) -> list[str]:
@@ -389,6 +399,7 @@ def main() -> None:
     parser.add_argument("--surfaces", default="truth")
     parser.add_argument("--phases", type=int, default=20, help="of the phantom's own surfaces")
     parser.add_argument("--peer", type=int, default=20)
+    parser.add_argument("--frames", default=FRAMES, help="of the studies, in turn")
     parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
     parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")
     parser.add_argument("--reading", choices=["network", "grey"], default="network")

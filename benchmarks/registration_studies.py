@@ -26,7 +26,7 @@ from pipeline.products import read_surfaces, read_table
 from pipeline.registration.correction import tracker_from_picture
 
 SWEEPS, RECORDED = 2, 24
-"""How many sweeps are recorded, and frames in each."""
+"""How many sweeps are recorded, and frames in each where no study has more."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,13 @@ class Order:
     snr_db: float | None
     """Level of muscle over added noise in the middle of the picture; None: the scanner's own."""
 
+    recorded: int = RECORDED
+    """Frames of each sweep that its own are chosen from, evenly."""
+
     @property
     def recording(self) -> str:
         """Name of the file of pictures it is drawn from."""
-        return f"{self.seed}-{self.pathology}-{self.probe}-{SWEEPS * RECORDED}-0-own"
+        return f"{self.seed}-{self.pathology}-{self.probe}-{SWEEPS * self.recorded}-0-own"
 
     @property
     def name(self) -> str:
@@ -59,7 +62,7 @@ class Order:
 
     def settings(self) -> PhantomSettings:
         """Of the phantom."""
-        ultrasound = {"probe": self.probe, "sweeps": SWEEPS, "frames": RECORDED}
+        ultrasound = {"probe": self.probe, "sweeps": SWEEPS, "frames": self.recorded}
         return PhantomSettings.model_validate(
             {"seed": self.seed, "pathology": self.pathology, "ultrasound": ultrasound}
         )
@@ -98,10 +101,12 @@ def make_study(order: Order, folder: Path) -> Study:
         np.savez_compressed(partial, **arrays)
         partial.rename(path)
     rng = np.random.default_rng([order.seed, 99])
-    chosen = np.linspace(0, RECORDED - 1, order.frames // SWEEPS).round().astype(np.int64)
     sweeps, phases = [], []
     with np.load(path) as kept:
         for k in range(SWEEPS):
+            # Of an odd number the first sweep has one more.
+            count = (order.frames + SWEEPS - 1 - k) // SWEEPS
+            chosen = np.linspace(0, order.recorded - 1, count).round().astype(np.int64)
             images, poses = kept[f"images_{k}"], kept[f"poses_{k}"]
             shown = worsened(rng, images, poses, chosen, order, k)
             sweeps.append(TrackedSweep(f"sweep_{k:03d}", shown, poses[chosen]))

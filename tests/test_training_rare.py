@@ -1,4 +1,4 @@
-"""Training images show what few hearts have: bulging scars, thick right walls."""
+"""Training images show what few hearts and scanners do: scars, thick right walls, filters."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from data_synth.tissue import Tissue
 from data_synth.training import render
+from data_synth.training.faults import filtered
 from data_synth.training.rare import bulged, draw_scar, scarred, thick_right_walled
 from data_synth.training.render import ALL_PARTS, draw_sample
 
@@ -155,3 +156,39 @@ def test_rare_hearts_are_among_what_is_drawn_where_asked_for(monkeypatch, rare):
         assert {layers for _, layers in asked["thick_right_walled"]} == {1, 2, 3, 4}
     else:
         assert counts["bulged"] == 0
+
+
+def test_a_console_sharpens_or_smooths_some_images():
+    disc = np.where(AWAY < 28, 1.0, 0.2).astype(np.float32)
+    disc[2, 2] = 0.9
+    counts = np.zeros(3)
+    for seed in range(300):
+        found = filtered(np.random.default_rng(seed), np.broadcast_to(disc, (3, SIDE, SIDE)))
+        assert found.min() >= 0
+        seen = found[:, 10:]
+        # A straight edge of height h overshoots by half of what is added of h, 0.64 at most.
+        assert seen.max() < 1.01 + 0.64
+        # Far from edges nothing changes.
+        np.testing.assert_allclose(found[:, MIDDLE, MIDDLE], 1.0, atol=1e-4)
+        np.testing.assert_allclose(found[:, 90, 5], 0.2, atol=1e-4)
+        sharper, smoother = seen.max() > 1.01, found[0, 2, 2] < 0.3
+        counts += [sharper, smoother, sharper and smoother]
+    # Of three in ten that are sharpened one in eight is cut off besides, which takes the seam away.
+    # Three deviations of a share of 300 are 0.08 about 0.26, 0.05 about 0.1.
+    assert counts[0] / 300 == pytest.approx(0.26, abs=0.08)
+    assert counts[1] / 300 == pytest.approx(0.1, abs=0.05)
+    assert counts[2] == 0
+
+
+def test_a_console_cuts_off_what_is_brightest_in_some_images():
+    noise = np.random.default_rng(0).uniform(1, 2, (3, SIDE, SIDE)).astype(np.float32)
+    shares = []
+    for seed in range(300):
+        found = filtered(np.random.default_rng(seed), noise)
+        # What is brightest is one pixel, or where a median spreads it, a patch of 25 of 27,648.
+        share = (found == found.max()).mean()
+        if share > 0.01:
+            shares.append(share)
+    # Three deviations of a share of 300 are 0.056; 3 to 20 % of the pixels are cut off.
+    assert len(shares) / 300 == pytest.approx(0.12, abs=0.06)
+    assert 0.025 < min(shares) < max(shares) < 0.205

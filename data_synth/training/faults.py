@@ -15,8 +15,11 @@ def smooth_noise(rng: np.random.Generator, side: int, knots: int) -> Float32:
     return np.asarray(cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC))
 
 
-def spoil(rng: np.random.Generator, image: Float32) -> Float32:
-    """Give ``(3, row, column)`` images the faults of one acquisition, each drawn at random."""
+def spoil(rng: np.random.Generator, image: Float32, filters: bool = True) -> Float32:
+    """Give ``(3, row, column)`` images the faults of one acquisition, each drawn at random.
+
+    ``filters``: and what a console's filters make of some of them.
+    """
     image = image * _shading(rng, image.shape[-1])
     image = image * np.exp(rng.normal(0.0, 0.06, (3, 1, 1))).astype(np.float32)
     sigma = rng.uniform(0.0, 1.1)
@@ -29,6 +32,8 @@ def spoil(rng: np.random.Generator, image: Float32) -> Float32:
     if rng.random() < 0.3:
         image = _through_frequency_space(rng, image)
     image = _noisy(rng, image)
+    if filters:
+        image = filtered(rng, image)
     image = np.stack([normalise(channel) for channel in image])
     if rng.random() < 0.7:
         image = np.sign(image) * np.abs(image) ** np.float32(np.exp(rng.uniform(-0.4, 0.4)))
@@ -101,6 +106,25 @@ def windowed(rng: np.random.Generator, image: Float32) -> Float32:
     )
     spectrum = np.fft.fft2(image) * rows[:, None] * columns
     return np.abs(np.fft.ifft2(spectrum)).astype(np.float32)
+
+
+def filtered(rng: np.random.Generator, image: Float32) -> Float32:
+    """``(3, row, column)`` images as a scanner's console may show them.
+
+    Sharpened, so that edges have a bright and a dark seam, or freed of what is finer than some
+    pixels; and with all that is brighter than some share of the pixels cut off alike.
+    """
+    chance = rng.random()
+    if chance < 0.3:
+        amount, reach_px = rng.uniform(0.2, 1.6), rng.uniform(0.7, 2.5)
+        soft = np.stack([cv2.GaussianBlur(channel, (0, 0), reach_px) for channel in image])
+        image = np.maximum(image + np.float32(amount) * (image - soft), 0)
+    elif chance < 0.4:
+        side = int(rng.choice([3, 5]))
+        image = np.stack([cv2.medianBlur(channel, side) for channel in image])
+    if rng.random() < 0.12:
+        image = np.minimum(image, np.quantile(image, rng.uniform(0.8, 0.97)))
+    return np.asarray(image, np.float32)
 
 
 def _noisy(rng: np.random.Generator, image: Float32) -> Float32:

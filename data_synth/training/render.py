@@ -108,6 +108,9 @@ class Parts:
     span: bool = True
     """Right ventricles that reach farther about the left one, or less far."""
 
+    filters: bool = True
+    """Images sharpened, smoothed or cut off by a scanner's console."""
+
 
 ALL_PARTS = Parts()
 
@@ -167,7 +170,7 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     carried = [cv2.remap(one, columns, rows, cv2.INTER_NEAREST) for one in labels]
     if parts.fine and parts.faults and rng.random() < 0.45:
         image = windowed(rng, image)
-    spoiled = spoil(rng, image) if parts.faults else spoil_little(rng, image)
+    spoiled = spoil(rng, image, parts.filters) if parts.faults else spoil_little(rng, image)
     return Sample(spoiled, np.stack(carried))
 
 
