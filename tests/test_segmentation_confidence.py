@@ -18,6 +18,7 @@ from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import (
+    _require_cavity,
     _require_right_ventricle,
     cut_off,
     missed_hearts,
@@ -303,6 +304,22 @@ def test_a_slice_without_neighbours_is_not_unlike_them(count, step):
     """Three slices 5 mm apart: those 9 mm away from the middle one are not there."""
     heart = np.ones((2, count, 6, 6), bool)
     np.testing.assert_array_equal(confidence._best_overlap_in_space(heart, step), 1)
+
+
+@pytest.mark.parametrize(
+    ("end_diastole", "end_systole", "refused"), [(0, 0, True), (30, 9, True), (60, 0, False)]
+)
+def test_muscle_without_a_cavity_in_any_phase_is_no_heart(end_diastole, end_systole, refused):
+    """Thick muscle may shut its cavity at end-systole, not through the whole beat."""
+    drawn = np.zeros((2, 3, 64, 64), np.uint8)
+    drawn[:, :, :20, :20] = 2
+    for phase, pixels in ((0, end_diastole), (1, end_systole)):
+        drawn[phase].reshape(3, -1)[:, -(pixels // 3) - 1 : -1] = 1
+    if not refused:
+        _require_cavity(drawn)
+        return
+    with pytest.raises(StageError, match=r"phase 0, slices 0 to 2: no heart found: .* least 5 %"):
+        _require_cavity(drawn)
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,10 @@ FEWEST_GREYS = 16
 LARGEST_BARE = 0.5
 """Share of the cavity's border, over all slices, at which neither muscle nor a chamber may lie."""
 
+LEAST_CAVITY = 0.05
+"""Of the left ventricle's muscle, in the phase that shows most of it: the thickest of two
+renderers' hearts show 0.44, and what is no heart may look like muscle without a cavity."""
+
 LEAST_RIGHT = 0.1
 """Of the left ventricle with its muscle, or of the atria where they are smaller: hearts of two
 renderers show 0.4 and more, and stacks of the tip alone no atrium."""
@@ -130,6 +134,7 @@ def segment_cine(
     end_at_dark_line(found, cine)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
+    _require_cavity(drawn)
     _require_right_ventricle(drawn)
     crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
     acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
@@ -251,6 +256,22 @@ def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> N
             f"left ventricle is {volume_ml.min():.0f} ml, at least "
             f"{settings.min_ventricle_ml:.0f} ml were expected; check the images, or lower "
             "segment.min_ventricle_ml"
+        )
+
+
+def _require_cavity(drawn: Label) -> None:
+    """Refuse what looks like a left ventricle that is muscle throughout in all phases."""
+    cavity, muscle = (
+        (drawn == LABELS[name]).sum(axis=(1, 2, 3)) for name in BODIES["left ventricle"]
+    )
+    share = cavity / np.maximum(muscle, 1)
+    if share.max() < LEAST_CAVITY:
+        raise StageError(
+            f"phase {share.argmax()}, slices 0 to {drawn.shape[1] - 1}: no heart found: what looks "
+            f"like the left ventricle's cavity is {100 * share.max():.1f} % of what looks like its "
+            f"muscle, and less in other phases, at least {100 * LEAST_CAVITY:.0f} % were expected; "
+            "check that the study is a cardiac cine, and leave series of other parts of the body "
+            "out"
         )
 
 
