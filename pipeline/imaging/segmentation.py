@@ -269,7 +269,7 @@ def _require_cavity(drawn: Label) -> None:
         raise StageError(
             f"phase {share.argmax()}, slices 0 to {drawn.shape[1] - 1}: no heart found: what looks "
             f"like the left ventricle's cavity is {100 * share.max():.1f} % of what looks like its "
-            f"muscle, and less in other phases, at least {100 * LEAST_CAVITY:.0f} % were expected; "
+            f"muscle, no more in other phases, at least {100 * LEAST_CAVITY:.0f} % were expected; "
             "check that the study is a cardiac cine, and leave series of other parts of the body "
             "out"
         )
