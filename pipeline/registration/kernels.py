@@ -103,7 +103,7 @@ def bend(  # type: ignore[no-untyped-def]
     blood and wall (``pushes``), with each other, and with the trend."""
     phases, depth, height, width, _ = share.shape
     m = index_from_tracker
-    slope, change = np.zeros(3), np.zeros(6)
+    change = np.zeros(6)
     for f in range(len(first) - 1):
         before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
         for s in range(first[f], first[f + 1]):
@@ -115,16 +115,13 @@ def bend(  # type: ignore[no-untyped-def]
             i, j, k = math.floor(at[0]), math.floor(at[1]), math.floor(at[2])
             if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
                 near = np.float32(at[0] - i), np.float32(at[1] - j), np.float32(at[2] - k)
-                slope[:] = 0
-                blood, wall = _slope(share, before, k, j, i, near, coefficients[f], slope)
-                if late > 0:
-                    slope *= 1 - late
-                    now = _slope(share, after, k, j, i, near, late * coefficients[f], slope)
-                    blood += late * (now[0] - blood)
-                    wall += late * (now[1] - wall)
+                blood, wall, slope_x, slope_y, slope_z = _slope(
+                    share, before, after, late, k, j, i, near, coefficients[f]
+                )
                 if blood > 0 or wall > 0:
-                    for axis in range(3):
-                        change[axis] = slope[axis] / spacing_mm[axis]
+                    change[0] = slope_x / spacing_mm[0]
+                    change[1] = slope_y / spacing_mm[1]
+                    change[2] = slope_z / spacing_mm[2]
                     ax = (x - centre[0]) * spacing_mm[0] * turn
                     ay = (y - centre[1]) * spacing_mm[1] * turn
                     az = (z - centre[2]) * spacing_mm[2] * turn
@@ -143,22 +140,27 @@ def bend(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _slope(share, phase, k, j, i, near, coefficients, slope):  # type: ignore[no-untyped-def]
-    """Trilinear blood and wall in one phase; adds the slope of their sum under the coefficients,
-    a node, to ``slope``."""
-    blood, wall = np.float32(0), np.float32(0)
-    one = np.float32(1)
+def _slope(share, before, after, late, k, j, i, near, coefficients):  # type: ignore[no-untyped-def]
+    """Trilinear blood and wall between two phases, and the slope of their sum under the
+    coefficients, a node, along x, y and z."""
+    x, y, z = near
+    one, nothing = np.float32(1), np.float32(0)
+    early = one - late
+    blood, wall, slope_x, slope_y, slope_z = nothing, nothing, nothing, nothing, nothing
     for dk in range(2):
-        wk, sk = (near[2], one) if dk else (one - near[2], -one)
+        wk, sk = (z, one) if dk else (one - z, -one)
         for dj in range(2):
-            wj, sj = (near[1], one) if dj else (one - near[1], -one)
-            for di in range(2):
-                wi, si = (near[0], one) if di else (one - near[0], -one)
-                node = share[phase, k + dk, j + dj, i + di]
-                value = coefficients[0] * node[0] + coefficients[1] * node[1]
-                blood += wi * wj * wk * node[0]
-                wall += wi * wj * wk * node[1]
-                slope[0] += si * wj * wk * value
-                slope[1] += wi * sj * wk * value
-                slope[2] += wi * wj * sk * value
-    return blood, wall
+            wj, sj = (y, one) if dj else (one - y, -one)
+            row, next_row = share[before, k + dk, j + dj], share[after, k + dk, j + dj]
+            left_blood = early * row[i, 0] + late * next_row[i, 0]
+            left_wall = early * row[i, 1] + late * next_row[i, 1]
+            rise_blood = early * row[i + 1, 0] + late * next_row[i + 1, 0] - left_blood
+            rise_wall = early * row[i + 1, 1] + late * next_row[i + 1, 1] - left_wall
+            here_blood, here_wall = left_blood + x * rise_blood, left_wall + x * rise_wall
+            blood += wj * wk * here_blood
+            wall += wj * wk * here_wall
+            here = coefficients[0] * here_blood + coefficients[1] * here_wall
+            slope_x += wj * wk * (coefficients[0] * rise_blood + coefficients[1] * rise_wall)
+            slope_y += sj * wk * here
+            slope_z += sk * wj * here
+    return blood, wall, slope_x, slope_y, slope_z

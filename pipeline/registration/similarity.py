@@ -11,7 +11,10 @@ Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -24,6 +27,8 @@ from pipeline.registration.tissue_map import TissueMap
 # Grey values of variance 1 explained by less than this say nothing: it keeps the fit solvable
 # where a frame misses the heart.
 _RIDGE = 1e-3
+# Fewer samples are added up before another thread would have started.
+_THREADS, _SAMPLES_A_THREAD = 2, 16_384
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,18 +103,17 @@ def expansion(
     place = _Place.of(samples, tissue, mr_from_tracker, shift_mm)
     fit = _fitted(samples, tissue, place)
     frames = samples.frames
+    coefficients, spacing_mm = fit.coefficients.astype(np.float32), np.array(tissue.grid.spacing_mm)
+    centre = (np.asarray(centre_mm) - tissue.grid.origin_mm) / spacing_mm
     pushes, squares = np.zeros((frames, 3, 6)), np.zeros((frames, 6, 6))
     with_trend = np.zeros((frames, 6, samples.trend.shape[1]))
-    bend(
-        *_looked_at(samples, tissue, place),
-        fit.coefficients.astype(np.float32),
-        np.array(tissue.grid.spacing_mm),
-        (np.asarray(centre_mm) - tissue.grid.origin_mm) / tissue.grid.spacing_mm,
-        1 / lever_mm,
-        pushes,
-        squares,
-        with_trend,
-    )
+
+    def add(some: slice) -> None:
+        arms = coefficients[some], spacing_mm, centre, 1 / lever_mm
+        sums = pushes[some], squares[some], with_trend[some]
+        bend(*_looked_at(samples, tissue, place, some), *arms, *sums)
+
+    _in_parts(add, samples)
     return _expanded(fit, np.diff(samples.first), pushes, squares, with_trend)
 
 
@@ -162,26 +166,45 @@ class _Fit:
     """``(frames, 2, columns)`` of blood and wall."""
 
 
-def _looked_at(samples: Samples, tissue: TissueMap, place: _Place) -> tuple[Any, ...]:
-    """What both kernels need of the frames and the model, in their order."""
+def _looked_at(samples: Samples, tissue: TissueMap, place: _Place, some: slice) -> tuple[Any, ...]:
+    """What both kernels need of some of the frames and the model, in their order."""
     return (
         samples.points_mm,
         samples.grey,
         samples.trend,
-        samples.trend_row,
-        samples.first,
-        place.lower,
-        place.weight,
+        samples.trend_row[some],
+        samples.first[some.start : some.stop + 1],
+        place.lower[some],
+        place.weight[some],
         tissue.share,
         place.index_from_tracker,
-        place.shift,
+        place.shift[some],
     )
+
+
+def _in_parts(add: Callable[[slice], None], samples: Samples) -> None:
+    """Add up all frames, each by one thread, several at the same time where they are many."""
+    threads = min(_THREADS, int(samples.first[-1]) // _SAMPLES_A_THREAD)
+    if threads < 2:
+        add(slice(0, samples.frames))
+        return
+    edges = np.linspace(0, samples.frames, threads + 1).astype(int).tolist()
+    first, *others = (slice(*pair) for pair in pairwise(edges))
+    with ThreadPoolExecutor(threads - 1) as pool:
+        rest = pool.map(add, others)
+        # One thread that need not be started.
+        add(first)
+        list(rest)
 
 
 def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
     sums = np.zeros((samples.frames, SUMS))
     with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
-    add_up(*_looked_at(samples, tissue, place), sums, with_trend)
+
+    def add(some: slice) -> None:
+        add_up(*_looked_at(samples, tissue, place, some), sums[some], with_trend[some])
+
+    _in_parts(add, samples)
     return _explained(sums, with_trend, np.diff(samples.first))
 
 
