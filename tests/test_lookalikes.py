@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 
 from pipeline.imaging.lookalikes import (
     ATRIUM_TOO_OFTEN,
+    ATRIUM_TOO_SELDOM,
     clear_apex,
+    favour_left_atrium,
     favour_right_ventricle,
     part_from_right_heart,
 )
@@ -141,3 +143,24 @@ def test_odds_of_right_ventricle_and_atrium_change_by_the_factor_and_nothing_els
     # Bayes' rule: odds after = odds before times the ratio of the priors.
     ours, theirs = after[RV] * before[RA], ATRIUM_TOO_OFTEN * before[RV] * after[RA]
     assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
+
+
+@given(st.lists(st.floats(0, 1), min_size=7, max_size=7).filter(lambda shares: sum(shares) > 0.1))
+def test_the_left_atriums_odds_rise_by_one_factor_and_the_others_keep_theirs(shares):
+    value = np.array(shares, np.float32)[None, None, :, None, None] / np.float32(sum(shares))
+    before = value[0, 0, :, 0, 0].copy()
+    favour_left_atrium(value)
+    after = value[0, 0, :, 0, 0]
+    assert after.sum() == pytest.approx(1, abs=1e-5)
+    # Odds of the atrium against each other structure, cross-multiplied: either may be nothing.
+    others = np.delete(np.arange(7), LA)
+    np.testing.assert_allclose(
+        after[LA] * before[others],
+        ATRIUM_TOO_SELDOM * before[LA] * after[others],
+        rtol=1e-4,
+        atol=1e-6,
+    )
+    # Among themselves they stay as they were.
+    np.testing.assert_allclose(
+        after[others] * before[others[0]], before[others] * after[others[0]], rtol=1e-4, atol=1e-6
+    )

@@ -28,6 +28,10 @@ ATRIUM_TOO_OFTEN = 2.5
 """How much more often training shows right atrium than right ventricle where the two meet. Chosen
 by Dice on ten people of the second renderer and four phantoms, of 1, 2.5 and 6.7."""
 
+ATRIUM_TOO_SELDOM = 1.4
+"""How much more often a pixel at its border is left atrium than the network says. Chosen by Dice on
+44 people of the second renderer and 8 phantoms, of 1, 1.4 and 2."""
+
 LEAST_CUT = 0.1
 """A smaller share of the ventricle's widest cut does not make a plane its tip."""
 
@@ -72,6 +76,23 @@ def favour_right_ventricle(value: Float32) -> None:
         odds = np.maximum(ventricle + atrium / ATRIUM_TOO_OFTEN, np.finfo(np.float32).tiny)
         ventricle[:] = np.minimum(either * (ventricle / odds), either)
         atrium[:] = either - ventricle
+
+
+def favour_left_atrium(value: Float32) -> None:
+    """Give the left atrium the pixels at its border that the network is a little too shy to give.
+
+    Its odds against all else are multiplied by one factor. Changes ``value`` in place.
+
+    Parameters
+    ----------
+    value
+        ``(phase, plane, class, row, column)`` probabilities.
+    """
+    for part in value:
+        atrium = part[:, LABELS["left_atrium"]]
+        whole = 1 + (ATRIUM_TOO_SELDOM - 1) * atrium
+        atrium *= ATRIUM_TOO_SELDOM
+        part /= whole[:, None]
 
 
 def ventricle_cuts(value: Float32) -> Float:

@@ -26,7 +26,11 @@ from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
-from pipeline.imaging.lookalikes import clear_apex, favour_right_ventricle
+from pipeline.imaging.lookalikes import (
+    clear_apex,
+    favour_left_atrium,
+    favour_right_ventricle,
+)
 from pipeline.imaging.plain_blood import settle_plain_blood
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import Orientation, View
@@ -122,6 +126,7 @@ def segment_cine(
     found = label_probability(cine, place.view, settings.most_views, progress)
     clear_apex(found.value)
     favour_right_ventricle(found.value)
+    favour_left_atrium(found.value)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
     seen = _drawn(found)
     _require_ring(seen, found.view)
