@@ -69,12 +69,16 @@ TRAIN := $(BIN)/python -m data_synth.training --pool training/pool --workers $(W
 
 train: setup ## make both networks' weights anew from the phantom (needs PyTorch; a GPU: half an hour)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(TRAIN) --out training --steps 87850 --fresh 4 --without span --without filters
+	$(TRAIN) --out training --steps 87850 --fresh 4 --without span --without filters \
+		--without mishaps
 	$(TRAIN) --out training/second --start training/heart.pt --seed 1 --hearts 10 --more 0 600 \
-		--learning-rate 4e-4 --steps 2050 --batch 16 --fresh 12 --kept 5000 --without filters
+		--learning-rate 4e-4 --steps 2050 --batch 16 --fresh 12 --kept 5000 --without filters \
+		--without mishaps
 	$(TRAIN) --out training/third --start training/second/heart.pt --more 1 10 \
-		--learning-rate 3e-4 --steps 3050 --batch 16 --fresh 12 --kept 5000
-	cp training/third/heart.onnx pipeline/imaging/weights/heart.onnx
+		--learning-rate 3e-4 --steps 3050 --batch 16 --fresh 12 --kept 5000 --without mishaps
+	$(TRAIN) --out training/fourth --start training/third/heart.pt --more 1 10 \
+		--learning-rate 3e-4 --steps 2950 --batch 16 --fresh 12 --kept 5000
+	cp training/fourth/heart.onnx pipeline/imaging/weights/heart.onnx
 	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound --workers $(WORKERS)
 	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 

@@ -1,4 +1,5 @@
-"""Training images show what few hearts and scanners do: scars, thick right walls, filters."""
+"""Training images show what few hearts and scanners do: scars, thick right walls, filters, and
+what spoils one image in many."""
 
 from dataclasses import replace
 
@@ -9,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from data_synth.tissue import Tissue
-from data_synth.training import render
-from data_synth.training.faults import filtered
+from data_synth.training import faults, render
+from data_synth.training.faults import filtered, folded_over, in_blocks, with_metal, with_spikes
 from data_synth.training.rare import bulged, draw_scar, scarred, thick_right_walled
 from data_synth.training.render import ALL_PARTS, draw_sample
 
@@ -192,3 +193,98 @@ def test_a_console_cuts_off_what_is_brightest_in_some_images():
     # Three deviations of a share of 300 are 0.056; 3 to 20 % of the pixels are cut off.
     assert len(shares) / 300 == pytest.approx(0.12, abs=0.06)
     assert 0.025 < min(shares) < max(shares) < 0.205
+
+
+@given(st.integers(0, 10_000))
+def test_metal_blots_out_one_place_and_piles_its_signal_up_around_it(seed):
+    plain = np.ones((3, SIDE, SIDE), np.float32)
+    found = with_metal(np.random.default_rng(seed), plain)
+    assert (found == found[0]).all()
+    # A blot in a corner may show its rim alone; 25 pixels across and half a rim more is the most.
+    assert found.min() < 0.97
+    assert 0 <= found.min() <= found.max() <= 1 + 1.5
+    rows, columns = np.nonzero(np.abs(found[0] - 1) > 0.02)
+    assert np.hypot(np.ptp(rows), np.ptp(columns)) < 2 * 25 * 1.7
+
+
+@given(st.integers(0, 10_000))
+def test_what_folds_over_is_the_other_side_of_the_picture_and_the_rest_stays(seed):
+    image = np.random.default_rng(0).uniform(1, 2, (3, SIDE, SIDE)).astype(np.float32)
+    added = folded_over(np.random.default_rng(seed), image) - image
+    reached = added[0] > 0
+    rows, columns = reached.all(axis=1), reached.all(axis=0)
+    band = rows if rows.any() and not rows.all() else columns
+    assert (reached == (rows[:, None] if band is rows else columns)).all()
+    width = band.sum()
+    assert 0.09 * SIDE < width <= 0.3 * SIDE
+    assert band[:width].all() or band[-width:].all()
+    # The band of as many lines at the other side is what was added, by one factor.
+    lines = image if band is rows else image.swapaxes(1, 2)
+    shown = added if band is rows else added.swapaxes(1, 2)
+    factor = shown[:, band] / lines[:, band[::-1]]
+    np.testing.assert_allclose(factor, factor[0, 0, 0], rtol=1e-3)
+    assert 0.3 <= factor[0, 0, 0] <= 1.0
+
+
+def test_spikes_put_few_waves_into_one_image_or_into_all_three():
+    plain = np.full((3, SIDE, SIDE), 10, np.float32)
+    spoilt = []
+    for seed in range(60):
+        added = with_spikes(np.random.default_rng(seed), plain) - 10
+        # Three spikes of a quarter each.
+        assert np.abs(added).max() <= 0.75
+        shown = np.abs(added).max(axis=(1, 2)) > 0.01
+        spoilt.append(int(shown.sum()))
+        # On so bright a ground a wave adds its real part: two peaks, each spread over some
+        # frequencies of the grid, out of 9,216.
+        power = np.sort(np.abs(np.fft.fft2(added[shown][0])).ravel() ** 2)
+        assert power[-150:].sum() > 0.8 * power.sum()
+    assert set(spoilt) == {1, 3}
+    # Three deviations of a half of 60 are 0.19.
+    assert spoilt.count(3) / 60 == pytest.approx(0.5, abs=0.2)
+
+
+def test_compression_keeps_even_greys_and_changes_fine_grain():
+    even = np.full((3, SIDE, SIDE), 0.7, np.float32)
+    grain = np.random.default_rng(1).uniform(-0.2, 1.6, (3, SIDE, SIDE)).astype(np.float32)
+    for seed in range(20):
+        # The coarsest step of a block's mean at quality 8 is an eighth of 100 grey levels.
+        kept = in_blocks(np.random.default_rng(seed), even)
+        np.testing.assert_allclose(kept, 0.7, atol=(100 / 8 / 2 + 1) * 1.8 / 255)
+        found = in_blocks(np.random.default_rng(seed), grain)
+        assert found.min() >= -0.2 - 1e-6
+        assert found.max() <= 1.6 + 1e-6
+        assert 0.05 < np.abs(found - grain).mean() < 0.6
+
+
+def test_uneven_noise_is_stronger_in_some_places_than_in_others():
+    plain = np.full((3, SIDE, SIDE), 10, np.float32)
+
+    def strengths(uneven):
+        """Standard deviations in 16 patches of the picture, as shares of their mean, by seed."""
+        for seed in range(40):
+            found = faults._noisy(np.random.default_rng(seed), plain, uneven)
+            patches = found.reshape(3, 4, SIDE // 4, 4, SIDE // 4).std(axis=(0, 2, 4))
+            yield patches / patches.mean()
+
+    assert max(np.ptp(one) for one in strengths(uneven=False)) < 0.35
+    assert np.median([np.ptp(one) for one in strengths(uneven=True)]) > 0.8
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_mishaps_are_among_what_is_drawn_where_asked_for(monkeypatch, asked):
+    counts = dict.fromkeys(("with_metal", "folded_over", "with_spikes", "in_blocks"), 0)
+    for name in counts:
+
+        def noted(rng, image, name=name):
+            counts[name] += 1
+            return image
+
+        monkeypatch.setattr(faults, name, noted)
+    plain = np.random.default_rng(0).uniform(0, 1, (3, SIDE, SIDE)).astype(np.float32)
+    for seed in range(300):
+        faults.spoil(np.random.default_rng(seed), plain, filters=False, mishaps=asked)
+    for name, count in counts.items():
+        usual = 0.08 if name == "with_spikes" else 0.06
+        # Three deviations of 0.08 drawn 300 times are 0.047.
+        assert count / 300 == pytest.approx(usual * asked, abs=0.047 * asked), name

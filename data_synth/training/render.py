@@ -111,6 +111,9 @@ class Parts:
     filters: bool = True
     """Images sharpened, smoothed or cut off by a scanner's console."""
 
+    mishaps: bool = True
+    """Metal, the body folded over, spikes, noise of uneven strength, and lossy compression."""
+
 
 ALL_PARTS = Parts()
 
@@ -170,8 +173,11 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     carried = [cv2.remap(one, columns, rows, cv2.INTER_NEAREST) for one in labels]
     if parts.fine and parts.faults and rng.random() < 0.45:
         image = windowed(rng, image)
-    spoiled = spoil(rng, image, parts.filters) if parts.faults else spoil_little(rng, image)
-    return Sample(spoiled, np.stack(carried))
+    if parts.faults:
+        image = spoil(rng, image, parts.filters, parts.mishaps)
+    else:
+        image = spoil_little(rng, image)
+    return Sample(image, np.stack(carried))
 
 
 def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[Label, int]:
