@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
 from pipeline.geometry import Float, Grid, MovingSurface, Surface, transform_points
+from pipeline.registration import similarity
 from pipeline.registration.frames import sample_frames
 from pipeline.registration.pose_search import climb, pivot_of
 from pipeline.registration.search import Level
@@ -275,6 +276,25 @@ class TestExpansion:
     def test_losses_are_those_of_the_agreement(self, recording, level, pivot):
         pose = start_off(recording, 1, 3, 3)
         np.testing.assert_allclose(level.expansion(pose, pivot).losses, level.losses(pose))
+
+    @pytest.mark.parametrize("case", ["as it is", "breath"])
+    def test_frames_count_alike_alone_and_shared_among_threads(
+        self, monkeypatch, recording, level, pivot, case
+    ):
+        if case == "breath":
+            rng = np.random.default_rng(3)
+            level = replace(level, shift_mm=rng.normal(0, 3, (level.samples.frames, 3)))
+        pose = start_off(recording, 4, 3, 3)
+        each = [level.only(np.array([k])) for k in range(level.samples.frames)]
+        alone = [one.expansion(pose, pivot) for one in each]
+        monkeypatch.setattr(similarity, "_SAMPLES_A_THREAD", 1)
+        monkeypatch.setattr(similarity, "_THREADS", 3)
+
+        shared = level.expansion(pose, pivot)
+
+        np.testing.assert_array_equal(shared.losses, np.concatenate([o.losses for o in alone]))
+        np.testing.assert_array_equal(shared.slopes, np.concatenate([o.slopes for o in alone]))
+        np.testing.assert_allclose(shared.bending, sum(one.bending for one in alone), rtol=1e-9)
 
 
 class TestClimb:

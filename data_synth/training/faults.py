@@ -181,8 +181,9 @@ def in_blocks(rng: np.random.Generator, image: Float32) -> Float32:
     """``(3, row, column)`` images of grey values from -0.2 to 1.6 after lossy compression."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(8, 50))]
     bytes_ = np.rint((image + 0.2) * (255 / 1.8)).astype(np.uint8)
-    coded = [cv2.imdecode(cv2.imencode(".jpg", one, quality)[1], 0) for one in bytes_]
-    return np.asarray(np.stack(coded) * (1.8 / 255) - 0.2, np.float32)
+    coded = [cv2.imencode(".jpg", one, quality)[1] for one in bytes_]
+    shown = np.stack([np.asarray(cv2.imdecode(one, cv2.IMREAD_GRAYSCALE)) for one in coded])
+    return np.asarray(shown * (1.8 / 255) - 0.2, np.float32)
 
 
 def _noisy(rng: np.random.Generator, image: Float32, uneven: bool) -> Float32:

@@ -184,7 +184,7 @@ def _looked_at(samples: Samples, tissue: TissueMap, place: _Place, some: slice) 
 
 def _in_parts(add: Callable[[slice], None], samples: Samples) -> None:
     """Add up all frames, each by one thread, several at the same time where they are many."""
-    threads = min(_THREADS, int(samples.first[-1]) // _SAMPLES_A_THREAD)
+    threads = min(_THREADS, samples.frames, int(samples.first[-1]) // _SAMPLES_A_THREAD)
     if threads < 2:
         add(slice(0, samples.frames))
         return
