@@ -66,19 +66,24 @@ bench: setup ## speed beside peers, as ratios in one run
 	$(BIN)/pytest --benchmark-enable --benchmark-only -q benchmarks
 
 TRAIN := $(BIN)/python -m data_synth.training --pool training/pool --workers $(WORKERS)
+NARROW := --widths 16 40 88 168 272
 
-train: setup ## make both networks' weights anew from the phantom (needs PyTorch; a GPU: half an hour)
+train: setup ## make both networks' weights anew from the phantom (needs PyTorch; a GPU: an hour)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
-	$(TRAIN) --out training --steps 87850 --fresh 4 --without span --without filters \
+	$(TRAIN) --out training $(NARROW) --steps 87850 --fresh 4 --without span --without filters \
 		--without mishaps
-	$(TRAIN) --out training/second --start training/heart.pt --seed 1 --hearts 10 --more 0 600 \
+	$(TRAIN) --out training/second $(NARROW) --start training/heart.pt --seed 1 --hearts 10 --more 0 600 \
 		--learning-rate 4e-4 --steps 2050 --batch 16 --fresh 12 --kept 5000 --without filters \
 		--without mishaps
-	$(TRAIN) --out training/third --start training/second/heart.pt --more 1 10 \
+	$(TRAIN) --out training/third $(NARROW) --start training/second/heart.pt --more 1 10 \
 		--learning-rate 3e-4 --steps 3050 --batch 16 --fresh 12 --kept 5000 --without mishaps
-	$(TRAIN) --out training/fourth --start training/third/heart.pt --more 1 10 \
+	$(TRAIN) --out training/fourth $(NARROW) --start training/third/heart.pt --more 1 10 \
 		--learning-rate 3e-4 --steps 2950 --batch 16 --fresh 12 --kept 5000
-	cp training/fourth/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(TRAIN) --out training/fifth --start training/fourth/heart.pt --more 1 10 --more 2 290 \
+		--learning-rate 1.5e-3 --steps 36850 --fresh 6
+	$(TRAIN) --out training/sixth --start training/fifth/heart.pt --seed 1 --hearts 10 \
+		--more 0 600 --more 2 290 --learning-rate 3e-4 --steps 2390 --batch 16 --fresh 16 --kept 1000
+	cp training/sixth/heart.onnx pipeline/imaging/weights/heart.onnx
 	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound --workers $(WORKERS)
 	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from pipeline.imaging.lookalikes import (
     ATRIUM_TOO_OFTEN,
     ATRIUM_TOO_SELDOM,
+    CAVITY_TOO_SELDOM,
     clear_apex,
     favour_left_atrium,
+    favour_left_cavity,
     favour_right_ventricle,
     part_from_right_heart,
 )
@@ -126,22 +128,32 @@ def test_where_no_ventricle_is_nothing_is_cleared():
     np.testing.assert_array_equal(value.argmax(axis=2), labels)
 
 
+@pytest.mark.parametrize(
+    ("favour", "gains", "loses", "factor"),
+    [
+        (favour_right_ventricle, RV, RA, ATRIUM_TOO_OFTEN),
+        (favour_left_cavity, CAVITY, MUSCLE, CAVITY_TOO_SELDOM),
+    ],
+)
 @given(
-    rv=st.floats(0, 1, width=32),
-    ra=st.floats(0, 1, width=32),
+    one=st.floats(0, 1, width=32),
+    other=st.floats(0, 1, width=32),
     rest=st.floats(0.125, 1, width=32),
 )
-def test_odds_of_right_ventricle_and_atrium_change_by_the_factor_and_nothing_else(rv, ra, rest):
+def test_odds_of_two_structures_change_by_the_factor_and_nothing_else(
+    favour, gains, loses, factor, one, other, rest
+):
     value = np.zeros((1, 1, 7, 1, 1), np.float32)
-    value[0, 0, [RV, RA, 0], 0, 0] = np.array([rv, ra, rest]) / (rv + ra + rest)
+    value[0, 0, [gains, loses, 0], 0, 0] = np.array([one, other, rest]) / (one + other + rest)
     before = value[0, 0, :, 0, 0].copy()
-    favour_right_ventricle(value)
+    favour(value)
     after = value[0, 0, :, 0, 0]
-    np.testing.assert_array_equal(np.delete(after, [RV, RA]), np.delete(before, [RV, RA]))
+    two = [gains, loses]
+    np.testing.assert_array_equal(np.delete(after, two), np.delete(before, two))
     assert after.min() >= 0
-    assert after[RV] + after[RA] == pytest.approx(before[RV] + before[RA], abs=1e-6)
+    assert after[two].sum() == pytest.approx(before[two].sum(), abs=1e-6)
     # Bayes' rule: odds after = odds before times the ratio of the priors.
-    ours, theirs = after[RV] * before[RA], ATRIUM_TOO_OFTEN * before[RV] * after[RA]
+    ours, theirs = after[gains] * before[loses], factor * before[gains] * after[loses]
     assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
 
 

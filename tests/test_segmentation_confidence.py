@@ -341,17 +341,23 @@ def test_left_ventricle_and_atria_without_a_right_ventricle_are_no_heart(right, 
 def test_a_heart_is_missed_between_two_and_not_above_stray_pixels():
     """Squares of 20 by 20 pixels in five slices; what the tip's slices show differs."""
     drawn = np.zeros((2, 5, 40, 40), np.uint8)
-    drawn[:, :, 10:30, 10:30] = LABELS["lv_myocardium"]
+    drawn[:, :, 10:30, 10:30] = LABELS["lv_cavity"]
     assert not len(missed_hearts(drawn, 1.5))
 
     drawn[0, 3] = 0
     np.testing.assert_array_equal(missed_hearts(drawn, 1.5), [[0, 3]])
     # A fifth of what both show is enough.
-    drawn[0, 3, 10:14, 10:30] = LABELS["lv_myocardium"]
+    drawn[0, 3, 10:14, 10:30] = LABELS["lv_cavity"]
     assert not len(missed_hearts(drawn, 1.5))
 
     drawn[1, :2] = 0
-    drawn[1, 0, 20, 18:23] = LABELS["lv_myocardium"]
+    drawn[1, 0, 20, 18:23] = LABELS["lv_cavity"]
     assert not len(missed_hearts(drawn, 1.5))
     # Five pixels of 4.5 mm are as large as 45 of 1.5 mm.
     np.testing.assert_array_equal(missed_hearts(drawn, 4.5), [[1, 1]])
+
+    # Muscle without a cavity, in line with the tip, is as likely fat.
+    drawn[1, 0, 10:30, 10:30] = LABELS["lv_myocardium"]
+    assert not len(missed_hearts(drawn, 1.5))
+    drawn[1, 0, 15:25, 15:25] = LABELS["lv_cavity"]
+    np.testing.assert_array_equal(missed_hearts(drawn, 1.5), [[1, 1]])

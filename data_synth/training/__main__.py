@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_synth.training.loop import TrainSettings, train
+from data_synth.training.loop import TrainSettings, load_weights, train
+from data_synth.training.network import WIDTHS, HeartNet, take_over
 from data_synth.training.pool import PoolSettings, fill_pool
 from data_synth.training.render import Parts
 
@@ -24,6 +25,11 @@ def main(arguments: list[str] | None = None) -> int:
     # Before hearts are made, which takes most of an hour.
     if options.start is not None and not options.start.is_file():
         parser.error(f"--start: {options.start} is no file; give the heart.pt of an earlier run")
+    if options.start is not None:
+        try:
+            take_over(HeartNet(options.widths), load_weights(options.start))
+        except ValueError as error:
+            parser.error(f"--start: {options.start}: {error}; give --widths as wide or wider")
     options.out.mkdir(parents=True, exist_ok=True)
     pool = PoolSettings(hearts=options.hearts, spread=options.spread, seed=options.seed)
     folder = options.pool or options.out / "pool"
@@ -41,6 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         fresh=options.fresh,
         kept=options.kept,
         learning_rate=options.learning_rate,
+        widths=tuple(options.widths),
         start=options.start,
         parts=Parts(**dict.fromkeys(options.without, False)),
         seed=options.seed,
@@ -74,7 +81,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--fresh", type=int, default=8, help="of them drawn anew")
     parser.add_argument("--kept", type=int, default=60_000, help="images kept to be seen again")
     parser.add_argument("--learning-rate", type=float, default=2e-3, help="largest step size")
-    parser.add_argument("--start", type=Path, help="heart.pt of an earlier run to go on from")
+    parser.add_argument(
+        "--start", type=Path, help="heart.pt of an earlier run, as wide or narrower, to go on from"
+    )
+    parser.add_argument(
+        "--widths", nargs=len(WIDTHS), type=int, default=WIDTHS, metavar="CHANNELS",
+        help="channels of the network at full, half, ... resolution",
+    )  # fmt: skip
     parser.add_argument(
         "--without", action="append", default=[], choices=[part.name for part in fields(Parts)],
         help="leave a part of the randomisation out, to see what it is worth",

@@ -17,7 +17,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from data_synth.training.export import write_onnx
-from data_synth.training.network import HeartNet, UNet, loss
+from data_synth.training.network import WIDTHS, HeartNet, UNet, loss, take_over
 from data_synth.training.render import ALL_PARTS, Parts, draw_sample
 
 Label = npt.NDArray[np.uint8]
@@ -49,8 +49,12 @@ class TrainSettings:
     would make the network too sure of itself late. A run that goes on from a checkpoint has the
     second all along."""
 
+    widths: tuple[int, ...] = WIDTHS
+    """Channels of the network of MR."""
+
     start: Path | None = None
-    """Checkpoint to go on from; by default weights are drawn at random."""
+    """Checkpoint to go on from, of as wide a network or a narrower one; by default weights are
+    drawn at random."""
 
     parts: Parts = ALL_PARTS
     """What is drawn at random in the images."""
@@ -147,7 +151,11 @@ def train(
 ) -> HeartNet:
     """Train the network of MR, writing ``out/heart.onnx`` and ``out/heart.pt``: see `learn`."""
     draw = draw_from(blocks, settings.parts)
-    return learn(HeartNet, draw, HEART_STREAM, loss, settings, out / "heart", report)
+
+    def make() -> HeartNet:
+        return HeartNet(settings.widths)
+
+    return learn(make, draw, HEART_STREAM, loss, settings, out / "heart", report)
 
 
 def draw_from(blocks: Sequence[Label], parts: Parts = ALL_PARTS) -> Draw:
@@ -195,12 +203,13 @@ def learn(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = make().to(memory_format=torch.channels_last)
     if settings.start is not None:
-        network.load_state_dict(torch.load(settings.start, weights_only=True))
+        take_over(network, load_weights(settings.start))
     network = network.to(device)
     average, echo = Average(network), Echo(settings.kept, settings.seed)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3, fused=True)
     started_s = time.monotonic()
     exported_s = started_s
+    waiting: tuple[int, Any, float] | None = None
     for step, (images, labels) in enumerate(batches):
         minutes = (time.monotonic() - started_s) / 60
         done = max(step / settings.steps, minutes / settings.minutes)
@@ -214,13 +223,22 @@ def learn(
         batch = echo.joined(images, labels, settings.batch)
         value = _learn(network, optimiser, *batch, rate, weight, loss_of)
         average.update(network)
-        if report is not None:
-            report(step + 1, value, minutes)
+        # A step late: to wait for a loss is to leave the graphics processor idle meanwhile.
+        _report(report, waiting)
+        waiting = step + 1, value, minutes
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
             save(out, average.network)
+    _report(report, waiting)
     save(out, average.network)
     return average.network
+
+
+def _report(report: Report | None, learned: tuple[int, Any, float] | None) -> None:
+    """Tell the number, loss and minutes of a step, where there is one to tell."""
+    if report is not None and learned is not None:
+        step, value, minutes = learned
+        report(step, float(value.item()), minutes)
 
 
 def _ahead(batches: Batches, settings: TrainSettings) -> Iterator[tuple[Any, Any]]:
@@ -238,6 +256,12 @@ def _ahead(batches: Batches, settings: TrainSettings) -> Iterator[tuple[Any, Any
             prefetch_factor=8,
         )
     )
+
+
+def load_weights(checkpoint: Path) -> dict[str, Any]:
+    """Weights by name, as `save` wrote them."""
+    weights: dict[str, Any] = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    return weights
 
 
 def save(out: Path, network: UNet) -> None:
@@ -260,7 +284,7 @@ def _learn(
     rate: float,
     overlap_weight: float,
     loss_of: Loss,
-) -> float:
+) -> Any:
     """One step of gradient descent; returns the loss."""
     for group in optimiser.param_groups:
         group["lr"] = rate
@@ -272,4 +296,4 @@ def _learn(
     value.backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
     optimiser.step()
-    return float(value.item())
+    return value.detach()

@@ -3,7 +3,7 @@ beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from data_synth.training.contrast import CLASSES
 
-WIDTHS = (16, 40, 88, 168, 272)
+WIDTHS = (24, 56, 120, 224, 352)
 """Channels at full, half, ... resolution."""
 
 PLANES = 3
@@ -63,8 +63,40 @@ class UNet(nn.Module):  # type: ignore[misc]  # torch is not type-checked
 class HeartNet(UNet):
     """Three neighbouring slices in, seven classes on three planes out, plane by plane."""
 
-    def __init__(self) -> None:
-        super().__init__(3, PLANES * CLASSES, WIDTHS)
+    def __init__(self, widths: Sequence[int] = WIDTHS) -> None:
+        super().__init__(3, PLANES * CLASSES, widths)
+
+
+def take_over(network: UNet, weights: Mapping[str, Any]) -> None:
+    """Give the network the weights of another, as wide or narrower, whose scores it then returns.
+
+    A wider network's other channels keep what they were drawn with, but nothing that was there
+    before listens to them yet: the first steps tell them apart, and bring them in.
+
+    Raises
+    ------
+    ValueError
+        When the weights are not of a network of the same shape, as wide or narrower.
+    """
+    own = network.state_dict()
+    if own.keys() != weights.keys():
+        raise ValueError("the checkpoint is of another kind of network")
+    for name, held in own.items():
+        given = weights[name]
+        if given.ndim != held.ndim or any(
+            few > many for few, many in zip(given.shape, held.shape, strict=True)
+        ):
+            shapes = f"{tuple(given.shape)} into {tuple(held.shape)}"
+            raise ValueError(f"the checkpoint's {name} does not fit: {shapes}")
+        if held.ndim == 0:
+            held.copy_(given)
+            continue
+        outputs = slice(len(given))
+        if held.ndim > 1:
+            held[outputs] = 0
+            held[outputs, : given.shape[1]] = given
+        else:
+            held[outputs] = given
 
 
 def loss(scores: Any, labels: Any, overlap_weight: float = 1.0) -> Any:

@@ -26,7 +26,7 @@ from pipeline.progress import Progress
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
 
-LOOKS = 900
+LOOKS = 700
 """Images that the network is shown in a study, about, where some can be shown in several ways."""
 
 

@@ -29,6 +29,7 @@ from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import (
     clear_apex,
     favour_left_atrium,
+    favour_left_cavity,
     favour_right_ventricle,
 )
 from pipeline.imaging.plain_blood import settle_plain_blood
@@ -127,6 +128,7 @@ def segment_cine(
     clear_apex(found.value)
     favour_right_ventricle(found.value)
     favour_left_atrium(found.value)
+    favour_left_cavity(found.value)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
     seen = _drawn(found)
     _require_ring(seen, found.view)
@@ -228,8 +230,11 @@ def missed_hearts(drawn: Label, pixel_mm: float) -> Integer:
         ``(phase, slice, row, column)`` labels.
     """
     heart = drawn > 0
-    # What one of them shows elsewhere, as a vessel or a bowel beyond the tip, is no heart missed.
-    both = (heart[:, :-2] & heart[:, 2:]).sum(axis=(2, 3))
+    # What one of them shows elsewhere, as a vessel or a bowel beyond the tip, is no heart missed;
+    # nor what looks like muscle alone, as fat in line with the tip.
+    blood = heart & (drawn != LABELS["lv_myocardium"])
+    shown = heart & blood.any(axis=(2, 3), keepdims=True)
+    both = (shown[:, :-2] & shown[:, 2:]).sum(axis=(2, 3))
     missed = heart[:, 1:-1].sum(axis=(2, 3)) < LEAST_SHARE * both
     phases, between = np.nonzero(missed & (both * pixel_mm**2 > LEAST_SHARED_MM2))
     return np.stack([phases, between + 1], axis=1)
