@@ -21,6 +21,7 @@ from data_synth.training.loop import (  # noqa: E402
     TrainSettings,
     draw_from,
     train,
+    varied,
 )
 from data_synth.training.network import PLANES, HeartNet, loss, take_over  # noqa: E402
 from data_synth.training.pool import (  # noqa: E402
@@ -190,6 +191,29 @@ def test_images_are_seen_again_until_others_take_their_place():
         assert set(again) <= set(range(max(0, number - 4), number))
     many = [echo.joined(images, images[:, 0].byte(), 6)[0][2:] for _ in range(3)]
     assert set(torch.cat(many).flatten().tolist()) <= {2.0, 3.0, 4.0, 5.0}
+
+
+def test_what_is_seen_again_is_changed_with_its_labels():
+    """A bright disc's labels stay on it; within its rim, as wide as interpolation blurs."""
+    rows, columns = torch.meshgrid(torch.arange(128.0), torch.arange(128.0), indexing="ij")
+    away = torch.hypot(rows - 70, columns - 50)
+    images = (away < 20).float().expand(40, 3, 128, 128)
+    torch.manual_seed(3)
+    changed, labels = varied(images, images.byte() * 4)
+    assert labels.dtype == torch.uint8
+    assert set(labels.unique().tolist()) == {0, 4}
+    middle = [(one == 4).nonzero().double().mean(0)[1:] for one in labels]
+    shift = torch.stack(middle) - torch.tensor([70.0, 50.0])
+    # One in two keeps its place.
+    assert 10 <= int((shift.norm(dim=1) < 0.01).sum()) <= 30
+    assert float(shift.norm(dim=1).max()) > 4
+    inside = torch.nn.functional.max_pool2d(-(labels == 4).float(), 5, 1, 2) == -1
+    outside = torch.nn.functional.max_pool2d((labels == 4).float(), 5, 1, 2) == 0
+    for grey, disc, around in zip(changed, inside, outside, strict=True):
+        assert float(grey[disc].mean()) > 0.9
+        assert abs(float(grey[around].mean())) < 0.05
+    # What an image is drawn with again is its own: no two have the same noise.
+    assert not torch.equal(*varied(images[:2], images[:2].byte())[0])
 
 
 def test_every_tissue_but_those_named_is_background():

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset
 
 from data_synth.training.export import write_onnx
@@ -73,6 +74,9 @@ Draw = Callable[[np.random.Generator], Sample]
 Loss = Callable[[Any, Any, float], Any]
 """Of scores and labels, with the weight of the Dice term."""
 
+Vary = Callable[[Any, Any], tuple[Any, Any]]
+"""Makes other images, and their labels, of a batch that has been seen before."""
+
 
 class Batches(Dataset):  # type: ignore[misc]  # torch is not type-checked
     """Batches of what ``draw`` gives; the seed, the stream and a batch's number fix it."""
@@ -99,8 +103,8 @@ class Echo:
     the network's own arithmetic is coarser than.
     """
 
-    def __init__(self, kept: int, seed: int) -> None:
-        self.kept, self.drawn = kept, 0
+    def __init__(self, kept: int, seed: int, vary: Vary | None = None) -> None:
+        self.kept, self.drawn, self.vary = kept, 0, vary
         self.picks = torch.Generator().manual_seed(seed)
         self.images: Any = None
         self.labels: Any = None
@@ -117,12 +121,41 @@ class Echo:
         # Two sizes in all: the best way to compute is sought anew for each.
         count = size - fresh if held >= size - fresh else 0
         again = torch.randint(max(held, 1), (count,), generator=self.picks).to(images.device)
-        both = torch.cat([images, self.images[again].float()])
-        of_both = torch.cat([labels, self.labels[again]])
+        seen, of_seen = self.images[again].float(), self.labels[again]
+        if self.vary is not None and count:
+            seen, of_seen = self.vary(seen, of_seen)
+        both, of_both = torch.cat([images, seen]), torch.cat([labels, of_seen])
         places = (torch.arange(self.drawn, self.drawn + fresh) % self.kept).to(images.device)
         self.images[places], self.labels[places] = images.half(), labels
         self.drawn += fresh
         return both, of_both
+
+
+def varied(images: Any, labels: Any) -> tuple[Any, Any]:
+    """Images ``(n, channel, row, column)`` a little turned, larger and aside, in other greys.
+
+    An image that comes back as it was is learnt by heart, its noise first. One in two keeps its
+    place, as interpolation blurs. Labels ``(n, plane, row, column)`` go with them.
+    """
+    count, device = len(images), images.device
+    normal = torch.randn(6, count, device=device)
+    moved = (torch.rand(count, device=device) < 0.5).float()
+    turn, size = 0.15 * moved * normal[0], torch.exp(0.06 * moved * normal[1])
+    across, down = 0.05 * moved * normal[2], 0.05 * moved * normal[3]
+    cosine, sine = size * turn.cos(), size * turn.sin()
+    affine = torch.stack([cosine, -sine, across, sine, cosine, down], 1).reshape(count, 2, 3)
+    places = functional.affine_grid(affine, list(images.shape), align_corners=False)
+
+    def there(of: Any, mode: str) -> Any:
+        return functional.grid_sample(
+            of, places, mode=mode, padding_mode="reflection", align_corners=False
+        )
+
+    grey = there(images, "bilinear")
+    grey = grey.sign() * grey.abs() ** torch.exp(0.15 * normal[4]).reshape(-1, 1, 1, 1)
+    noise = 0.03 * normal[5].abs().reshape(-1, 1, 1, 1)
+    grey = grey + noise * torch.randn_like(grey)
+    return grey, there(labels.float(), "nearest").to(labels.dtype)
 
 
 class Average:
@@ -155,7 +188,7 @@ def train(
     def make() -> HeartNet:
         return HeartNet(settings.widths)
 
-    return learn(make, draw, HEART_STREAM, loss, settings, out / "heart", report)
+    return learn(make, draw, HEART_STREAM, loss, settings, out / "heart", report, varied)
 
 
 def draw_from(blocks: Sequence[Label], parts: Parts = ALL_PARTS) -> Draw:
@@ -176,6 +209,7 @@ def learn(
     settings: TrainSettings,
     out: Path,
     report: Report | None = None,
+    vary: Vary | None = None,
 ) -> Net:
     """Train a network, writing ``out`` as ``.onnx`` and ``.pt`` now and then and at the end.
 
@@ -193,6 +227,8 @@ def learn(
         Keeps what is drawn apart from what is drawn for another network.
     loss_of
         What is made small.
+    vary
+        What an image goes through each time it is seen again.
     """
     torch.set_num_threads(settings.threads)
     torch.backends.cudnn.benchmark = True
@@ -205,7 +241,7 @@ def learn(
     if settings.start is not None:
         take_over(network, load_weights(settings.start))
     network = network.to(device)
-    average, echo = Average(network), Echo(settings.kept, settings.seed)
+    average, echo = Average(network), Echo(settings.kept, settings.seed, vary)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3, fused=True)
     started_s = time.monotonic()
     exported_s = started_s

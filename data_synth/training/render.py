@@ -132,7 +132,7 @@ class Sample:
 def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS) -> Sample:
     """Draw one image and its labels from a ``(plane, row, column)`` tissue block."""
     planes, end = _draw_planes(rng, block, parts)
-    scar = draw_scar(rng, planes[REACH]) if parts.rare and rng.random() < 0.12 else None
+    scar = draw_scar(rng, planes[REACH]) if parts.rare and rng.random() < 0.2 else None
     if scar is not None:
         planes = scarred(rng, planes, scar)
     bare = parts.bare and rng.random() < 0.55
