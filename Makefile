@@ -83,7 +83,13 @@ train: setup ## make both networks' weights anew from the phantom (needs PyTorch
 		--learning-rate 1.5e-3 --steps 36850 --fresh 6
 	$(TRAIN) --out training/sixth --start training/fifth/heart.pt --seed 1 --hearts 10 \
 		--more 0 600 --more 2 290 --learning-rate 3e-4 --steps 2390 --batch 16 --fresh 16 --kept 1000
-	cp training/sixth/heart.onnx pipeline/imaging/weights/heart.onnx
+	$(TRAIN) --out training/seventh --start training/sixth/heart.pt --seed 2 --hearts 290 \
+		--more 0 600 --more 1 10 --learning-rate 1e-3 --steps 54870 --fresh 6
+	$(TRAIN) --out training/eighth --start training/seventh/heart.pt --seed 1 --hearts 10 \
+		--more 2 290 --more 0 600 --learning-rate 3e-4 --steps 5670 --batch 16 --fresh 16 --kept 1000
+	$(TRAIN) --out training/mean --mean training/sixth/heart.pt --mean training/eighth/heart.pt \
+		--seed 1 --hearts 10 --more 2 290 --more 0 600
+	cp training/mean/heart.onnx pipeline/imaging/weights/heart.onnx
 	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound --workers $(WORKERS)
 	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 

@@ -20,6 +20,7 @@ from data_synth.training.loop import (  # noqa: E402
     Echo,
     TrainSettings,
     draw_from,
+    mean_of,
     train,
     varied,
 )
@@ -214,6 +215,29 @@ def test_what_is_seen_again_is_changed_with_its_labels():
         assert abs(float(grey[around].mean())) < 0.05
     # What an image is drawn with again is its own: no two have the same noise.
     assert not torch.equal(*varied(images[:2], images[:2].byte())[0])
+
+
+def test_the_mean_of_two_runs_lies_between_them(blocks, tmp_path, monkeypatch):
+    monkeypatch.setattr("data_synth.training.loop.MEAN_BATCHES", 2)
+    monkeypatch.setattr("data_synth.training.loop.MEAN_IMAGES", 4)
+    settings, paths = (
+        TrainSettings(widths=(8, 12, 12, 12, 12)),
+        [tmp_path / "a.pt", tmp_path / "b.pt"],
+    )
+    networks = [HeartNet(settings.widths) for _ in paths]
+    for network, path in zip(networks, paths, strict=True):
+        torch.save(network.state_dict(), path)
+    mean = mean_of(paths, draw_from(blocks), settings, tmp_path).state_dict()
+    first, second = (network.state_dict() for network in networks)
+    torch.testing.assert_close(
+        mean["head.weight"], (first["head.weight"] + second["head.weight"]) / 2
+    )
+    # Features are normalised by images, not by what either run had: neither has seen any.
+    assert float(mean["down.0.0.1.running_mean"].abs().max()) > 0.01
+    assert (tmp_path / "heart.onnx").is_file()
+    torch.save(HeartNet((4, 12, 12, 12, 12)).state_dict(), paths[1])
+    with pytest.raises(ValueError, match=r"b\.pt is not of a network of widths"):
+        mean_of(paths, draw_from(blocks), settings, tmp_path)
 
 
 def test_every_tissue_but_those_named_is_background():

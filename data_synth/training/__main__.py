@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_synth.training.loop import TrainSettings, load_weights, train
+from data_synth.training.loop import TrainSettings, draw_from, load_weights, mean_of, train
 from data_synth.training.network import WIDTHS, HeartNet, take_over
 from data_synth.training.pool import PoolSettings, fill_pool
 from data_synth.training.render import Parts
@@ -23,6 +23,9 @@ def main(arguments: list[str] | None = None) -> int:
     if options.kept < options.batch:
         parser.error(f"--kept: {options.kept} images cannot fill batches of {options.batch}")
     # Before hearts are made, which takes most of an hour.
+    for path in options.mean:
+        if not path.is_file():
+            parser.error(f"--mean: {path} is no file; give the heart.pt of earlier runs")
     if options.start is not None and not options.start.is_file():
         parser.error(f"--start: {options.start} is no file; give the heart.pt of an earlier run")
     if options.start is not None:
@@ -55,6 +58,12 @@ def main(arguments: list[str] | None = None) -> int:
         threads=options.threads,
         workers=options.workers,
     )
+    if options.mean:
+        try:
+            mean_of(options.mean, draw_from(blocks, settings.parts), settings, options.out)
+        except ValueError as error:
+            parser.error(f"--mean: {error}; give --widths that all have")
+        return 0
     recent: list[float] = []
 
     def say(step: int, value: float, minutes: float) -> None:
@@ -84,6 +93,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--start", type=Path, help="heart.pt of an earlier run, as wide or narrower, to go on from"
     )
+    parser.add_argument(
+        "--mean", action="append", default=[], type=Path, metavar="HEART.PT",
+        help="learn nothing, but write the mean of earlier runs' weights; give it for each",
+    )  # fmt: skip
     parser.add_argument(
         "--widths", nargs=len(WIDTHS), type=int, default=WIDTHS, metavar="CHANNELS",
         help="channels of the network at full, half, ... resolution",

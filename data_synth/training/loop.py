@@ -28,6 +28,9 @@ Net = TypeVar("Net", bound=UNet)
 HEART_STREAM = 7002
 """Keeps what is drawn for this network apart from what is drawn for others of the same seed."""
 
+MEAN_BATCHES, MEAN_IMAGES = 40, 32
+"""Batches, and images of each, from which a mean network's features are normalised."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrainSettings:
@@ -189,6 +192,46 @@ def train(
         return HeartNet(settings.widths)
 
     return learn(make, draw, HEART_STREAM, loss, settings, out / "heart", report, varied)
+
+
+def mean_of(
+    checkpoints: Sequence[Path], draw: Draw, settings: TrainSettings, out: Path
+) -> HeartNet:
+    """Write ``out/heart.onnx`` and ``.pt`` with the mean of earlier runs' weights.
+
+    Runs that went on from one another lie in one valley of the loss, and between an earlier and a
+    later one a network keeps what the later learned and loses less on images of another kind
+    (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022). What features' means and
+    deviations are is found anew, from `MEAN_BATCHES` batches of images.
+
+    Raises
+    ------
+    ValueError
+        When a checkpoint is not of a network of the widths in ``settings``.
+    """
+    network = HeartNet(settings.widths)
+    own = network.state_dict()
+    given = [load_weights(path) for path in checkpoints]
+    for path, weights in zip(checkpoints, given, strict=True):
+        if {name: held.shape for name, held in weights.items()} != {
+            name: held.shape for name, held in own.items()
+        }:
+            raise ValueError(f"{path} is not of a network of widths {settings.widths}")
+    for name, held in own.items():
+        if held.dtype.is_floating_point:
+            held.copy_(torch.stack([weights[name] for weights in given]).mean(0))
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.reset_running_stats()
+            module.momentum = None
+    torch.set_num_threads(settings.threads)
+    drawn = Batches(draw, MEAN_BATCHES, MEAN_IMAGES, settings.seed, HEART_STREAM)
+    network.train()
+    with torch.no_grad():
+        for images, _ in _ahead(drawn, settings):
+            network(images)
+    save(out / "heart", network)
+    return network
 
 
 def draw_from(blocks: Sequence[Label], parts: Parts = ALL_PARTS) -> Draw:
