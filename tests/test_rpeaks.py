@@ -13,6 +13,7 @@ from pipeline.registration.rpeaks import (
     LEARN_S,
     RPeakDetector,
     _is_strange,
+    _is_wide,
     find_beats,
 )
 
@@ -220,6 +221,25 @@ def test_ventricular_beats_look_strange_and_others_hardly_ever(noise):
 )
 def test_another_shape_is_told_by_the_scatter_of_the_beats_before(likeness, others, strange):
     assert _is_strange(likeness, others) == strange
+
+
+@pytest.mark.parametrize(
+    ("broader", "others", "wide"),
+    [
+        # Five beats tell no scatter.
+        (2.0, [1.0] * 5, False),
+        (1.45, [1.0] * 6, True),
+        (1.35, [1.0] * 6, False),
+        # Usual beats are twice as broad for their height as those by which levels were learnt.
+        (2.7, [2.0] * 6, False),
+        (2.9, [2.0] * 6, True),
+        # A median absolute deviation of a tenth: four standard deviations are a factor of 1.76.
+        (1.7, [1 / 1.1, 1.0, 1.1] * 3, False),
+        (1.8, [1 / 1.1, 1.0, 1.1] * 3, True),
+    ],
+)
+def test_a_wide_beat_is_told_by_the_scatter_of_the_beats_before(broader, others, wide):
+    assert _is_wide(np.log(broader), np.log(others)) == wide
 
 
 def test_blocks_of_any_size_give_the_same_beats():

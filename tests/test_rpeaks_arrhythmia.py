@@ -52,6 +52,29 @@ def test_hard_cases_lose_few_beats(case):
     assert (pairs >= 0).sum() > 0.8 * len(found_s)
 
 
+@pytest.mark.parametrize(("noise_mv", "least"), [(0.01, 0.85), (0.05, 0.6)])
+def test_a_wide_beat_that_comes_in_time_is_called_one(noise_mv, least):
+    """Its summit is as narrow as the usual one's and points the same way: only its feet differ."""
+    rng = np.random.default_rng(5)
+    usual: Waves = (*P, (0.0, 0.011, 1.60, 1.30), *T)
+    wide: Waves = (
+        *((-0.045, 0.022, 0.60, 0.50), (0.0, 0.016, 1.00, 0.80), (0.045, 0.022, 0.80, 0.60)),
+        (0.20, 0.060, -0.60, -0.50),
+    )
+    times_s, r_s = np.arange(0, 120, 1 / 250), 0.4 + np.cumsum(rng.normal(0.7, 0.02, 165))
+    is_wide = rng.random(len(r_s)) < 0.2
+    beats = [(at, wide if other else usual) for at, other in zip(r_s, is_wide, strict=True)]
+    found = read_rhythm(draw(rng, times_s, beats, noise_mv=noise_mv), 250.0)
+    kinds = {True: [], False: []}
+    # The first beats tell no scatter yet.
+    for beat in (one for one in found if one.time_s > 10):
+        kinds[bool(is_wide[np.abs(r_s - beat.time_s).argmin()])].append(beat.kind)
+    assert len(kinds[True]) > 15
+    assert np.mean([kind == "ectopic" for kind in kinds[True]]) > least
+    # The clock may take a usual beat after a wide one for early.
+    assert np.mean([kind == "normal" for kind in kinds[False]]) > 0.97
+
+
 def test_a_p_wave_that_was_told_is_taken_back_when_its_beat_follows():
     drawn = record("weak beats, tall P", seed=3, duration_s=60.0)
     stream = RPeakDetector(drawn.rate_hz, 2).push(with_end_held(drawn.signal_mv, drawn.rate_hz))

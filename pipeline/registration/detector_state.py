@@ -185,6 +185,8 @@ class Found:
     height: float
     likeness: float
     """Correlation of its shape with the usual one."""
+    breadth: float
+    """How much less steep it is for its height than the usual beat."""
     late: bool
     instead: bool
     """Told in the place of the beat before, which was its P wave."""

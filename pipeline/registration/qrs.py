@@ -308,6 +308,7 @@ def _accept(
         if lead.weight > 0.0:
             contrast = max(contrast, usual.level / lead.noise)
     wave.known_at, wave.height, wave.late, wave.instead = now.seen - 1, height, late, instead
+    wave.breadth = now.tall / now.steep if now.steep > 0.0 else 1.0
     learn_beat(at, wave, anew, plan, s)
     now.found += 1
     if contrast < UNCLEAR and at - now.learn_at > RECENT_S * plan.rate_hz:

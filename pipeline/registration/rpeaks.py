@@ -40,10 +40,15 @@ LATENCY_S = 0.15
 known later: those while levels are learnt, and overdue ones whose energy was low (``late``)."""
 LEARN_S = 2.0
 """Levels are learnt for so long, and on to 6 s while no beat stands out."""
-KEPT_LIKENESSES, LEAST_LIKENESSES = 16, 6
-"""A beat's likeness is compared with those of so many beats before it, and with no fewer."""
+KEPT_SHAPES, LEAST_SHAPES = 16, 6
+"""A beat's likeness and breadth are compared with those of so many beats before it, and with no
+fewer."""
 LEAST_MARGIN, SCATTERS = 0.06, 3.0
 """Less alike than the median by both this and so many standard deviations is another shape."""
+WIDER, WIDE_SCATTERS = 1.4, 4.0
+"""So is what is broader for its height than the median by both so many times and so many standard
+deviations of the logarithm: complexes of 0.08 s, and of 0.12 s as the narrowest from the ventricle,
+are 1.5 apart."""
 # Of a normal distribution, by its median absolute deviation.
 _DEVIATION = 1.4826
 # The wavelet's standard deviation: its band is 6 to 33 Hz at half height, 19 Hz in the middle.
@@ -117,7 +122,8 @@ class RPeakDetector:
         self._plan = _plan(sampling_rate_hz)
         self._state = _state(self._plan, leads)
         self._leads = leads
-        self._likenesses: deque[float] = deque(maxlen=KEPT_LIKENESSES)
+        self._likenesses: deque[float] = deque(maxlen=KEPT_SHAPES)
+        self._breadths: deque[float] = deque(maxlen=KEPT_SHAPES)
 
     def push(self, samples_mv: npt.ArrayLike) -> list[Beat]:
         """Take the next sample ``(leads,)``, or several ``(n, leads)``; beats that became known.
@@ -150,8 +156,10 @@ class RPeakDetector:
 
     def _beat(self, found: Found) -> Beat:
         likeness = float(found.likeness)
-        strange = _is_strange(likeness, self._likenesses)
+        breadth = math.log(max(float(found.breadth), 1e-3))
+        strange = _is_strange(likeness, self._likenesses) or _is_wide(breadth, self._breadths)
         self._likenesses.append(likeness)
+        self._breadths.append(breadth)
         return Beat(
             time_s=float(found.time_s),
             known_s=float(found.known_at / self._plan.rate_hz),
@@ -200,11 +208,28 @@ def _is_strange(likeness: float, others: Collection[float]) -> bool:
     A wide beat that begins as the usual one does is about as alike as a usual one in noise: what
     tells them apart is how alike the beats before were.
     """
-    if len(others) < LEAST_LIKENESSES:
+    if len(others) < LEAST_SHAPES:
         return likeness < ALIKE
-    usual = statistics.median(others)
-    scatter = _DEVIATION * statistics.median(abs(other - usual) for other in others)
+    usual, scatter = _spread(others)
     return likeness < max(ALIKE, usual - max(LEAST_MARGIN, SCATTERS * scatter))
+
+
+def _is_wide(breadth: float, others: Collection[float]) -> bool:
+    """Whether a beat's breadth, a logarithm, is more than the scatter of ``others`` explains.
+
+    Shapes are compared in the band of the usual complex, in which a wide one about the same peak
+    looks much like it.
+    """
+    if len(others) < LEAST_SHAPES:
+        return False
+    usual, scatter = _spread(others)
+    return breadth > usual + max(math.log(WIDER), WIDE_SCATTERS * scatter)
+
+
+def _spread(values: Collection[float]) -> tuple[float, float]:
+    """Median, and standard deviation by the median absolute deviation."""
+    usual = statistics.median(values)
+    return usual, _DEVIATION * statistics.median(abs(value - usual) for value in values)
 
 
 def _plan(rate_hz: float) -> Plan:
