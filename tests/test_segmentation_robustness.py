@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,17 @@ REQUIRED = {"lv_cavity": 0.95, "lv_myocardium": 0.89, "rv_cavity": 0.93}
 """Dice required on the phantom's own images."""
 
 
+@cache
+def drawn(seed):
+    return render(seed, Scan())
+
+
 @pytest.fixture(scope="module", params=[1.0, 0.7], ids=["adults", "children"])
 def people(request):
     """Truth and labels of each person at end-diastole and end-systole; a child is all smaller."""
     pairs = []
     for seed in SEEDS:
-        outside = render(seed, Scan())
+        outside = drawn(seed)
         frame = outside.cine.mr_from_index.copy()
         frame[:3, :3] *= request.param
         found = segment_cine(replace(outside.cine, mr_from_index=frame), AS_USUAL)
