@@ -30,7 +30,7 @@ from pipeline.products import read_cine
 PHASES = 5
 
 STUDY_CONFIG = f"mr: {{phases: {PHASES}}}\nultrasound: {{frames: 25}}\n"
-RUN_CONFIG = "bake: {spacing_mm: 2.5}\n"
+RUN_CONFIG = "segment: {most_views: 2}\nbake: {spacing_mm: 2.5}\n"
 
 
 def beatfield(*arguments: object) -> subprocess.CompletedProcess[str]:
