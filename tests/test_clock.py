@@ -96,6 +96,14 @@ def test_where_valid_the_phase_neither_jumps_nor_turns_back():
     assert steps[both].max() < 1.5 * 2.0 * TICK_S / 0.6
 
 
+def test_the_beats_of_a_quicker_rhythm_are_normal_once_it_has_come_to_stay():
+    clock = PhaseClock(0.8)
+    r_s = np.cumsum([0.8] * 12 + [0.6] * 6)
+    kinds = [clock.beat(at_s) for at_s in r_s]
+    assert kinds[12:14] == ["ectopic", "ectopic"]
+    assert set(kinds[:12] + kinds[14:]) == {"normal"}
+
+
 @pytest.mark.parametrize("strange", [False, True])
 def test_an_early_beat_makes_the_phase_invalid_at_once(strange):
     r_s = regular()

@@ -298,6 +298,15 @@ def test_a_rate_outside_is_refused(rate_hz, leads, words):
         RPeakDetector(rate_hz, leads)
 
 
+@pytest.mark.parametrize("rate_hz", [100.0, 2000.0])
+def test_a_rate_told_by_rounded_times_is_no_other(rate_hz):
+    ecg = record(rate_hz=rate_hz, duration_s=10.0)
+    for near_hz in (rate_hz * (1 - 1e-6), rate_hz * (1 + 1e-6)):
+        found_s = [one.time_s for one in find_beats(ecg.signal_mv, near_hz)]
+        same_s = [one.time_s for one in find_beats(ecg.signal_mv, rate_hz)]
+        assert np.allclose(found_s, same_s, atol=1e-3)
+
+
 def test_another_number_of_leads_is_refused():
     with pytest.raises(InputError, match=r"needs \(n, 2\)"):
         RPeakDetector(250.0, 2).push([1.0, 2.0, 3.0])

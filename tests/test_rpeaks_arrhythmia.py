@@ -144,6 +144,25 @@ def test_t_waves_larger_than_r_are_known_by_coming_after_every_beat(t_share, rr_
     assert ((found_s > 7.9) & (found_s < 59.6)).sum() <= len(true_s) + 1
 
 
+@pytest.mark.parametrize("period_s", [4.0, 9.0])
+def test_high_t_waves_that_follow_breath_are_no_beats(period_s):
+    """They fall slowly and rise steeply, and are as tall as R where breath makes them large."""
+    rng = np.random.default_rng(5)
+    times_s = np.arange(60 * 360) / 360
+    r_times_s = 0.4 + np.cumsum(0.9 * (1 + 0.02 * rng.normal(size=65)))
+    beats = []
+    for at_s in r_times_s[r_times_s < 59.5]:
+        size = 0.65 * (1 + 0.6 * np.sin(2 * np.pi * at_s / period_s))
+        t_wave = ((0.25, 0.055, -size, 0.0), (0.33, 0.028, 0.5 * size, 0.0))
+        beats.append((at_s, (*P, (-0.018, 0.008, -0.4, 0.0), (0.0, 0.009, 0.7, 0.0), *t_wave)))
+    signal = draw(rng, times_s, beats, noise_mv=0.005)[:, :1]
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    true_s = np.array([at_s for at_s, _ in beats])
+    assert (matched(found_s, true_s, 0.1) >= 0).all()
+    # The first few are not known by having come before.
+    assert (found_s > 6.0).sum() <= (true_s > 5.9).sum() + 1
+
+
 def test_late_t_waves_of_a_blocked_bundle_are_none_where_all_beats_are_wide():
     rng = np.random.default_rng(5)
     times_s = np.arange(60 * 360) / 360

@@ -35,6 +35,8 @@ from pipeline.registration.qrs import feed
 from pipeline.registration.waves import ALIKE
 
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 100.0, 2000.0
+# A rate as little beyond is one of these: times are rounded, and recorders' clocks not exact.
+_GRACE = 1.0001
 LATENCY_S = 0.15
 """A beat is known this long after the middle of its QRS complex, and is final then. Two beats are
 known later: those while levels are learnt, and overdue ones whose energy was low (``late``)."""
@@ -112,7 +114,7 @@ class RPeakDetector:
     """
 
     def __init__(self, sampling_rate_hz: float, leads: int = 1) -> None:
-        if not LOWEST_RATE_HZ <= sampling_rate_hz <= HIGHEST_RATE_HZ:
+        if not is_fit_rate(sampling_rate_hz):
             raise InputError(
                 f"ECG: {sampling_rate_hz:g} samples a second; R peaks are found at "
                 f"{LOWEST_RATE_HZ:g} to {HIGHEST_RATE_HZ:g}; record or resample it so"
@@ -170,6 +172,11 @@ class RPeakDetector:
             strange=strange,
             instead=bool(found.instead),
         )
+
+
+def is_fit_rate(rate_hz: float) -> bool:
+    """Whether R peaks are found at so many samples a second: 100 to 2000, as told by a clock."""
+    return LOWEST_RATE_HZ / _GRACE <= rate_hz <= HIGHEST_RATE_HZ * _GRACE
 
 
 def find_beats(signal_mv: Float, sampling_rate_hz: float) -> list[Beat]:

@@ -39,6 +39,9 @@ T_DULL, T_USUAL, T_HIGHER = 0.7, 0.5, 1.5
 """A wave in that time that is less steep for its height than the last beat by the first factor may
 be a T wave, however high. It is one where, of late, as large a share of beats as the second had one
 then, and theirs were no lower than by the third factor."""
+VERY_DULL = 0.4
+"""Less steep for its height than the last beat by this factor are few beats of a ventricle: such a
+wave is a T wave where they came of late, however high. Theirs follow breath and posture."""
 T_NEAR, T_FOLLOW, T_EARLIER = 4, 1 / 6, 0.9
 """Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
 what is known of their energy, follow. It is so in this share of the time of T waves: coupled beats
@@ -192,7 +195,7 @@ def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool
     """Whether a wave is dull and comes when such waves have come after the beats before; its time
     is noted."""
     now, rhythm = s.now[0], s.now[0].rhythm
-    dull = now.steep * rhythm.last_tall < T_DULL * (rhythm.last_steep * now.tall)
+    dull = _is_duller_than_last(T_DULL, s)
     lower = height < rhythm.last_height and rhythm.last_sharp < SPIKE
     now.after = dull and lower and since_s < T_EARLIER * _t_wave_until_s(False, plan, s)
     if not now.after:
@@ -202,7 +205,15 @@ def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool
         rhythm.t_wave_now[k] = 1.0
     rhythm.t_height_now = max(rhythm.t_height_now, height)
     known = at < T_STEPS and rhythm.t_wave[at] > T_USUAL
-    return bool(known and height < T_HIGHER * rhythm.t_height)
+    expected = _is_duller_than_last(VERY_DULL, s) or height < T_HIGHER * rhythm.t_height
+    return bool(known and expected)
+
+
+@compiled
+def _is_duller_than_last(share: float, s: State) -> bool:
+    """Whether a wave is less steep for its height than the last beat, by that factor."""
+    now, rhythm = s.now[0], s.now[0].rhythm
+    return bool(now.steep * rhythm.last_tall < share * (rhythm.last_steep * now.tall))
 
 
 @compiled

@@ -168,10 +168,11 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     c[RINGS + place] = rr_s
     c[RINGS + KEPT + place] = -1.0 if strange else (1.0 if regular else 0.0)
     c[COUNT] += 1.0
-    _judge(c, regular, off_s)
+    settled = _judge(c, regular, off_s)
     if c[STATE] == FIBRILLATING:
         return IRREGULAR_BEAT
-    return ECTOPIC_BEAT if early else NORMAL_BEAT
+    # The third beat of a new rate is one of its rhythm.
+    return ECTOPIC_BEAT if early and not settled else NORMAL_BEAT
 
 
 @compiled
@@ -191,8 +192,9 @@ def _latest(c: Float) -> float:
 
 
 @compiled
-def _judge(c: Float, regular: bool, off_s: float) -> None:
-    """What the rhythm is with its latest interval, and when the next beat is due."""
+def _judge(c: Float, regular: bool, off_s: float) -> bool:
+    """What the rhythm is with its latest interval, and when the next beat is due; whether the last
+    intervals agree (:func:`_settled`)."""
     steady = _settled(c)
     if not regular and steady:
         for back in range(KEPT):
@@ -210,6 +212,7 @@ def _judge(c: Float, regular: bool, off_s: float) -> None:
     if c[STATE] != REGULAR:
         c[VALID] = 0.0
     _predict(c)
+    return steady
 
 
 @compiled

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.registration.clock import to_cycle
-from pipeline.registration.rpeaks import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, find_beats
+from pipeline.registration.rpeaks import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, find_beats, is_fit_rate
 
 _SHORTEST_RECORD_S = 3.0
 # Three years, which no recording lasts: such times are counted from 1970.
@@ -140,7 +140,7 @@ def median_rr_s(r_times_s: Float) -> float:
 def _require_record(signal_mv: Float, sampling_rate_hz: float) -> None:
     if signal_mv.ndim != 2:
         raise InputError(f"ECG: needs an array (samples, leads), got {signal_mv.shape}")
-    if not LOWEST_RATE_HZ <= sampling_rate_hz <= HIGHEST_RATE_HZ:
+    if not is_fit_rate(sampling_rate_hz):
         few = "few" if sampling_rate_hz < LOWEST_RATE_HZ else "many"
         raise InputError(
             f"ECG: {sampling_rate_hz:g} samples a second are too {few} to time an R peak; needs "

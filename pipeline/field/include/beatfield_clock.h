@@ -308,8 +308,9 @@ static void bfc_predict(bf_clock *c)
     c->known.rr_s = mean + bfc_min(bfc_max(step, -0.2 * mean), 0.2 * mean);
 }
 
-/* What the rhythm is with its latest interval, and when the next beat is due. */
-static void bfc_judge(bf_clock *c, int regular, double off_s)
+/* What the rhythm is with its latest interval, and when the next beat is due; whether the last
+   intervals agree (bfc_settled). */
+static int bfc_judge(bf_clock *c, int regular, double off_s)
 {
     int steady = bfc_settled(c), back;
     double share;
@@ -334,6 +335,7 @@ static void bfc_judge(bf_clock *c, int regular, double off_s)
     if (c->known.rhythm != BF_REGULAR)
         c->valid = 0;
     bfc_predict(c);
+    return steady;
 }
 
 /* The latest time that the clock was told of, by a question or by a beat. */
@@ -354,7 +356,7 @@ void bf_take_back(bf_clock *c)
 bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
 {
     double rr_s, off_s;
-    int known, regular, early, place;
+    int known, regular, early, place, settled;
     c->before = c->known;
     if (!isfinite(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
         return BF_NO_BEAT;
@@ -380,10 +382,11 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
     c->known.interval_s[place] = rr_s;
     c->known.regular[place] = strange ? -1 : regular;
     c->known.count += 1;
-    bfc_judge(c, regular, off_s);
+    settled = bfc_judge(c, regular, off_s);
     if (c->known.rhythm == BF_FIBRILLATING)
         return BF_IRREGULAR_BEAT;
-    return early ? BF_ECTOPIC_BEAT : BF_NORMAL_BEAT;
+    /* The third beat of a new rate is one of its rhythm. */
+    return early && !settled ? BF_ECTOPIC_BEAT : BF_NORMAL_BEAT;
 }
 
 /* Where the heart should be, if the interval is rr_s and the next beats come as due. */
