@@ -37,6 +37,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
+STUDY = "folder of the study: cine/, and where there are any ecg/, us/, study.yaml"
 Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]
 Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults without it")]
 
@@ -72,7 +73,7 @@ def _require_order(first: str | None, last: str | None) -> None:
 
 @app.command
 def run(
-    study: Path,
+    study: Annotated[Path, Parameter(help=STUDY)],
     /,
     *,
     out: Out,
@@ -84,8 +85,6 @@ def run(
 
     Parameters
     ----------
-    study
-        Folder of the study: cine/, and where there are any ecg/, us/, study.yaml.
     from_
         Run this stage and those after it even if nothing changed: ingest, segment, surface,
         register, bake, evaluate or report.
@@ -100,7 +99,9 @@ def run(
 
 
 def _stage_command(name: str, help_text: str) -> None:
-    def command(study: Path, /, *, out: Out, config: Config = None) -> int:
+    def command(
+        study: Annotated[Path, Parameter(help=STUDY)], /, *, out: Out, config: Config = None
+    ) -> int:
         record = _run(study, out, config, last=name)
         show(summary(record, out / record["patient_id"]))
         return 0
@@ -324,8 +325,9 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
 def rpeaks(record: Path, /, *, out: Path) -> int:
     """Find the R peaks of an electrocardiogram, as a stream would show them.
 
-    Writes a row for each beat: R time (s, on the recording's clock), kind, whether the phase could
-    be relied on, the best lead, RR interval, likeness to other beats, and when it became known.
+    Writes a row for each beat: R time (s, on the recording's clock), kind,
+    whether the phase was valid, best lead, RR interval, likeness to other beats,
+    and when it became known.
 
     Parameters
     ----------
@@ -371,7 +373,13 @@ def synth(
 
 @app.command
 def paper(out: Path, /, options: Annotated[PaperOptions, Parameter(name="*")] = PAPER) -> int:
-    """Repeat the paper's figures and table from a baked field: OUT/index.html and its figures."""
+    """Repeat the paper's figures and table from a baked field.
+
+    Parameters
+    ----------
+    out
+        Folder for index.html and its figures.
+    """
     from pipeline.paper.write import write_paper
 
     show(f"page      {write_paper(out, options, Console())}")

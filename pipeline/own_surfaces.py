@@ -359,7 +359,10 @@ def _place(folder: Path, path: Path) -> tuple[str, int]:
     """Structure and phase number of a file, from its name or its folder's."""
     if path.parent != folder:
         if not path.stem.isdecimal():
-            raise InputError(f"{path}: in a structure's folder, name files 000, 001 ... by phase")
+            raise InputError(
+                f"{path}: in a structure's folder, name files 000, 001 ... by phase; if files are "
+                f"named by structure and phase, give {path.parent} itself"
+            )
         return path.parent.name, int(path.stem)
     numbered = NUMBERED.fullmatch(path.stem)
     if numbered:

@@ -99,6 +99,10 @@ def readable_write_errors(target: Path) -> Iterator[None]:
         refused = Path(error.filename or "/")
         beside = refused.parent == target.parent and PARTIAL in refused.name
         no_folder = error.errno == errno.ENOENT and (beside or refused in target.parents)
+        if beside and no_folder:
+            raise InputError(
+                f"{target}: cannot be written: there is no folder {target.parent}; make it first"
+            ) from error
         if error.errno in REFUSED or no_folder:
             raise InputError(
                 f"{target}: cannot be written ({error.strerror}: {error.filename}); "

@@ -346,10 +346,30 @@ def test_csv_times_in_another_unit_are_told(tmp_path, unit, count, rate_hz):
         ("time_s,I\n0,1\n0.1,x\n", "line 3"),
         ("time_s,I\n0,1\n0.1,1,2\n", "line 3"),
         ("time_s,I\n0,1\n0.1,2\n0.2", "line 4"),
-        ("time_s,I\n0,1\nnan,2\n0.2,3\n", "does not rise"),
+        ("time_s,I\n0,1\nnan,2\n0.2,3\n", "line 3"),
+        ("time_s,I\n0,1\n0.1,inf\n", "line 3"),
+        ("time_s,I\n0,1\n0.1,\n", "write nan"),
+        ("time_s,I\n0,000,0,012\n", "write points"),
+        ("time_s;I\n0;1\n", "not by semicolons"),
+        ("time_s\tI\n0\t1\n", "not by tabs"),
+        ("# of a monitor\ntime_s,I\n0,1\n", "comments"),
+        ('"time (s)",I\n0,1\n', "call the first column time_s"),
+        ("time_s,I (uV)\n0,1\n0.1,2\n", "is in uV"),
     ],
 )
 def test_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
     (tmp_path / "ecg.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         read_ecg(tmp_path / "ecg.csv")
+
+
+def test_csv_in_utf_16_is_refused_with_the_remedy(tmp_path):
+    (tmp_path / "ecg.csv").write_text("time_s,I\n0,1\n", encoding="utf-16-le")
+    with pytest.raises(InputError, match="save it as UTF-8"):
+        read_ecg(tmp_path / "ecg.csv")
+
+
+def test_names_of_leads_are_no_units(tmp_path):
+    lines = [f"{k / 250:.3f},{k % 7},{k % 5}" for k in range(1000)]
+    (tmp_path / "ecg.csv").write_text("\n".join(["time_s,I (mV),lead (II)", *lines]))
+    assert read_ecg(tmp_path / "ecg.csv").leads == ("I (mV)", "lead (II)")

@@ -361,5 +361,8 @@ def test_both_languages_tell_the_same_share_outside_the_grid(path, program):
     np.testing.assert_allclose(found, known, rtol=0, atol=1e-12)
     assert found.min() == 0
     assert found.max() == 1
-    nothing = " ".join(["nan"] * 16).encode()
-    assert run(program, path, "outside", given=nothing).stdout.split() == [b"1", b"1", b"1"]
+    by_columns, in_metres = np.eye(4), np.diag([1e-3, 1e-3, 1e-3, 1])
+    by_columns[3, :3] = field.grid.upper_mm / 2
+    for refused in (np.full((4, 4), np.nan), by_columns, in_metres):
+        given = " ".join(map(repr, map(float, refused.ravel()))).encode()
+        assert run(program, path, "outside", given=given).stdout.split() == [b"1", b"1", b"1"]

@@ -338,7 +338,7 @@ def test_a_stack_that_ends_at_the_valves_is_baked_without_atria(work: Path, prod
 
     # What a user asks for by name is not left out: the bake fails and says why.
     one = "atrium: {structure: left_atrium, kind: guidance, gamma_mm: 3, m: 2, f_max_n: 2}"
-    (work / "atrium.yaml").write_text(f"fixtures:\n  {one}\n")
+    (work / "atrium.yaml").write_text(f"{RUN_CONFIG}fixtures:\n  {one}\n")
     failed = beatfield(*run[:-1], work / "atrium.yaml")
     assert failed.returncode == 2
     assert "fixture atrium needs left_atrium, which has no surface: no phase shows it" in (

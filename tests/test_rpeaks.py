@@ -7,6 +7,7 @@ import pytest
 
 from data_synth.ecg import EcgSettings, LostLead, simulate_ecg
 from pipeline.errors import InputError
+from pipeline.registration.qrs import feed
 from pipeline.registration.rhythm import doubt, read_rhythm
 from pipeline.registration.rpeaks import (
     LATENCY_S,
@@ -185,6 +186,29 @@ def test_missing_samples_are_a_lost_lead():
     broken = ecg.signal_mv.copy()
     broken[2000:4000, 1] = np.nan
     assert score(ecg, broken)[:2] == (0, 0)
+
+
+def test_no_interval_is_told_across_lost_leads():
+    ecg = record()
+    broken = ecg.signal_mv.copy()
+    broken[2000:2600] = np.nan
+    beats = read_rhythm(broken, 250.0)
+    across = next(one for one in beats if one.time_s > 2600 / 250)
+    assert np.isnan(across.rr_s)
+    assert [one for one in beats if np.isnan(one.rr_s)] == [beats[0], across]
+
+
+def test_samples_that_are_no_numbers_are_refused():
+    with pytest.raises(InputError, match="must be numbers"):
+        RPeakDetector(250.0).push("x")
+
+
+def test_a_rate_told_as_a_whole_number_compiles_nothing_anew():
+    """The kernels are compiled when a detector is made, for rates of one kind."""
+    detector = RPeakDetector(250)
+    kinds = len(feed.signatures)
+    detector.push(np.zeros(10)[:, None])
+    assert len(feed.signatures) == kinds == 1
 
 
 @pytest.mark.parametrize("noise", [{}, {"muscle_snr_db": 6.0, "magnetohydrodynamic_mv": 0.5}])

@@ -104,7 +104,7 @@ def test_a_folder_of_records_is_told_what_it_holds(ecg, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("record", "out", "words"),
-    [("none", "p.csv", "no such ECG"), ("rec", "nowhere/p.csv", "cannot be written")],
+    [("none", "p.csv", "no such ECG"), ("rec", "nowhere/p.csv", "nowhere; make it first")],
 )
 def test_trouble_ends_with_exit_code_2_and_no_file(ecg, tmp_path, capsys, record, out, words):
     write_wfdb(tmp_path, "rec", ecg)

@@ -31,6 +31,8 @@ def serve(field: ForceField, ecg: Ecg, tip_mm: tuple[float, float, float]) -> It
     fixture, law = next(iter(field.fixtures.items()))
     clock = PhaseClock(field.rr_s or USUAL_RR_S, f_max_n=law.f_max_n)
     detector = RPeakDetector(ecg.sampling_rate_hz, ecg.signal_mv.shape[1])
+    # A first question may have to compile its kernel, which no loop should wait for.
+    field.force_at(*tip_mm, 0.0, fixture)
     seen = 0
     for turn in range(int(len(ecg.signal_mv) / ecg.sampling_rate_hz * RATE_HZ)):
         passed_s = turn / RATE_HZ

@@ -212,7 +212,7 @@ DEFAULT_FIXTURES: dict[str, Fixture] = {
     "left_atrium_guidance": Fixture(
         structure="left_atrium", kind="guidance", gamma_mm=2.5, m=2, f_max_n=2.0
     ),
-    # A tool inside the left ventricle must not leave through the wall.
+    # A tool inside the left ventricle must not leave through the wall; one outside is pushed in.
     "left_ventricle_forbidden": Fixture(
         structure="epicardium",
         kind="forbidden_region",

@@ -83,6 +83,8 @@ def stiffness_words(figures: Mapping[str, Any]) -> str:
     measured, limit = figures["stiffness_measured_n_per_m"], figures["stiffness_limit_n_per_m"]
     found = "" if measured is None else f", at most {measured:.0f} as measured"
     most = "" if limit is None else f"; the device renders {limit:.0f}"
+    if limit is not None and measured is not None and measured > limit:
+        most += ", less than measured"
     return f"stiffness {figures['stiffness_n_per_m']:.0f} N/m by its law{found}{most}"
 
 

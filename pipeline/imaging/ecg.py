@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -24,6 +25,9 @@ MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
 MICRO_UNIT = re.compile(rb"^[^#\s]\S*\s+\S+\s+\S*/\S*?(?:\xb5|\xce\xbc)", re.MULTILINE)
 """A signal's line whose unit, after file and format, has a micro sign (Latin-1 or UTF-8, where
 another byte stands before it) or the Greek letter."""
+
+UNIT_OF_LEAD = re.compile(r"[(\[]\s*([^\W\d_]{1,2})\s*[)\]]$")
+"""A unit behind a lead's name, as in ``I (uV)``."""
 
 # Samples a second of an ECG: no two units of time that are a thousandfold apart both fit.
 _RATES_HZ = (100.0, 2000.0)
@@ -148,14 +152,35 @@ def _read_csv(path: Path) -> Ecg:
     if len(names) < 2 or names[0] != "time_s":
         raise InputError(
             f"{path}: the first row is {names}; it needs time_s and then the name of each lead, "
-            "separated by commas"
+            f"separated by commas{_remedy(lines[0] if lines else '')}"
         )
+    for name in names[1:]:
+        unit = UNIT_OF_LEAD.search(name)
+        if unit and _is_voltage(unit[1]) and _unit(unit[1]) != "mv":
+            raise InputError(
+                f"{path}: lead {name!r} is in {unit[1]}; a CSV file holds millivolts: write the "
+                "values so, and (mV) or nothing behind the name"
+            )
     rows = [_csv_row(path, number, line, len(names)) for number, line in enumerate(lines[1:], 2)]
     if len(rows) < 2:
         raise InputError(f"{path}: has {len(rows)} rows of samples; it needs 2 or more")
     table = np.array(rows)
     step_s = _even_step_s(table[:, 0], path)
     return Ecg(table[:, 1:], tuple(names[1:]), 1 / step_s, float(table[0, 0]))
+
+
+def _remedy(header: str) -> str:
+    """What to do about a first row that is no header of an ECG, where that can be told."""
+    if "\x00" in header:
+        return "; the text is UTF-16: save it as UTF-8"
+    if header.startswith("#"):
+        return "; delete the lines of comments above"
+    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+        if mark in header:
+            return f", not by {word}: replace them, and first of all any decimal commas by points"
+    if header.lstrip('"').lower().startswith(("time", "t,", "t ", "t(", "t[")):
+        return "; call the first column time_s, without quotes, and let it hold seconds"
+    return ""
 
 
 def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
@@ -165,12 +190,17 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
         values = [float(cell) for cell in cells]
     except ValueError:
         values = []
-    if len(values) != columns:
-        raise InputError(
-            f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
-            "mend or delete the line"
-        )
-    return values
+    if len(values) == columns and not any(map(math.isinf, values)) and math.isfinite(values[0]):
+        return values
+    remedy = "mend it, and delete no line: a gap in time is refused"
+    if len(cells) == columns and not all(cell.strip() for cell in cells[1:]):
+        remedy = "write nan where a sample is missing"
+    elif "." not in line and len(cells) == 2 * columns:
+        remedy = "decimal commas look like separators: write points"
+    raise InputError(
+        f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
+        f"{remedy}"
+    )
 
 
 def _even_step_s(times_s: Float, path: Path) -> float:
@@ -194,8 +224,9 @@ def _even_step_s(times_s: Float, path: Path) -> float:
         _refuse_jitter(off_s, even_s, steps_s, path)
         gap = int(np.argmax(steps_s))
         raise InputError(
-            f"{path}: samples are not evenly spaced: {steps_s[gap]:.6g} s after {times_s[gap]} s, "
-            f"where {even_s:.6g} s is the mean; fill the gap or cut the recording there"
+            f"{path}: samples are not evenly spaced: {steps_s[gap]:.6g} s after {times_s[gap]} s "
+            f"(line {gap + 2}), where {even_s:.6g} s is the mean; fill the gap with rows whose "
+            "leads are nan, or cut the recording there"
         )
     return even_s
 

@@ -101,7 +101,13 @@ class PhaseClock:
                 "both must be positive"
             )
         self._state = np.empty(ticks.SIZE)
-        ticks.reset(self._state, cycle_rr_s, force_rate_n_per_s / f_max_n, latency_s)
+        # All that a loop calls is compiled here, where a machine has not done so: on what is reset.
+        ticks.reset(self._state, float(cycle_rr_s), force_rate_n_per_s / f_max_n, float(latency_s))
+        ticks.beat(self._state, 0.0, False)
+        ticks.take_back(self._state)
+        ticks.advance(self._state, 0.0, False, False)
+        ticks.tolerance(self._state)
+        ticks.reset(self._state, float(cycle_rr_s), force_rate_n_per_s / f_max_n, float(latency_s))
 
     def beat(self, r_time_s: float, strange: bool = False) -> Kind | None:
         """Tell the clock of an R peak; what kind of beat it is.

@@ -39,7 +39,8 @@ class RhythmBeat:
     """Number of the lead that showed it best."""
 
     rr_s: float
-    """Interval since the beat before; not a number for the first."""
+    """Interval since the beat before; not a number for the first, and where all leads were lost
+    between the two."""
 
     likeness: float
     """Correlation of its shape with the usual one."""
@@ -70,19 +71,23 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
     padded = with_end_held(signal_mv, sampling_rate_hz)
     step = max(1, round(_STEP_S * sampling_rate_hz))
     found: list[RhythmBeat] = []
-    listed = False
+    listed, lost_s = False, [-math.inf]
     for start in range(0, len(padded), step):
         beats = detector.push(padded[start : start + step])
         kinds = [tell(clock, beat) for beat in beats]
         now_s = (min(start + step, len(padded)) - 1) / sampling_rate_hz
         valid = clock.at(now_s, detector.usable).valid
+        if not detector.usable:
+            lost_s.append(now_s)
         for beat, kind in zip(beats, kinds, strict=True):
             if beat.instead and listed:
                 found.pop()
             last_s = found[-1].time_s if found else math.nan
             listed = kind is not None and beat.time_s <= (len(signal_mv) - 1) / sampling_rate_hz
             if kind is not None and listed:
-                found.append(_row(beat, kind, valid, beat.time_s - last_s))
+                whole = not any(last_s < one < beat.time_s for one in lost_s)
+                found.append(_row(beat, kind, valid, beat.time_s - last_s if whole else math.nan))
+                lost_s = lost_s[-1:]
     return found
 
 

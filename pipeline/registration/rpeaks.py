@@ -100,6 +100,8 @@ class RPeakDetector:
     not a number, a voltage that stays the same after a jump, less of a swing than the heart ever
     lets it have (``quality``), and noise all take a lead's say.
 
+    Make it before a loop begins: the first one on a machine compiles for half a minute or more.
+
     Parameters
     ----------
     sampling_rate_hz
@@ -121,11 +123,13 @@ class RPeakDetector:
             )
         if leads < 1:
             raise InputError(f"ECG: {leads} leads; at least one is needed")
-        self._plan = _plan(sampling_rate_hz)
+        self._plan = _plan(float(sampling_rate_hz))
         self._state = _state(self._plan, leads)
         self._leads = leads
         self._likenesses: deque[float] = deque(maxlen=KEPT_SHAPES)
         self._breadths: deque[float] = deque(maxlen=KEPT_SHAPES)
+        # Compiled now, where a machine has not done so: the first sample cannot wait for it.
+        self._feed(np.empty((0, leads)))
 
     def push(self, samples_mv: npt.ArrayLike) -> list[Beat]:
         """Take the next sample ``(leads,)``, or several ``(n, leads)``; beats that became known.
@@ -133,9 +137,12 @@ class RPeakDetector:
         Raises
         ------
         InputError
-            When the number of leads is another.
+            When the number of leads is another, or a sample no number.
         """
-        block = np.atleast_2d(np.ascontiguousarray(samples_mv, dtype=np.float64))
+        try:
+            block = np.atleast_2d(np.ascontiguousarray(samples_mv, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"ECG: samples must be numbers ({error})") from error
         if block.ndim != 2 or block.shape[1] != self._leads:
             raise InputError(
                 f"ECG: samples of shape {np.shape(samples_mv)}; needs (n, {self._leads})"

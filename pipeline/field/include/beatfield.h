@@ -172,7 +172,8 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         double force_n[3], double torque_nmm[3], int *evaluations);
 
 /* Share of a tool's length that lies outside the grid, 0 to 1, where bf_tool_force is answered by the
- * grid's boundary: the more there is, the less the force tells. 1 where there is no telling. */
+ * grid's boundary: the more there is, the less the force tells. 1 where there is no telling, as by a pose that
+ * bf_tool_force refuses. */
 double bf_outside_share(const bf_field *field, const bf_tool *tool, const double mr_from_tool[16]);
 
 /* A moving fixture can push energy into the hand. A tank lets through only what it holds: energy
@@ -2011,6 +2012,7 @@ double bf_outside_share(const bf_field *field, const bf_tool *tool, const double
 {
     double total = 0, outside = 0, share;
     int n, axis, pieces = tool->closed ? tool->count : tool->count - 1;
+    if (!bf__rigid(mr_from_tool)) return 1;
     for (n = 0; n < pieces; n++) {
         double a[3], b[3], length = bf__length(tool, n), enters = 0, leaves = 1;
         bf_transform(mr_from_tool, tool->points_mm + 3 * (size_t)n, a);
