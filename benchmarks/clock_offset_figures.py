@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from registration_studies import found_surfaces, true_surfaces
+from registration_studies import found_surfaces, require_same, true_surfaces
 
 from data_synth.pathology import PATHOLOGIES
 from data_synth.probe import EXAMINATIONS
@@ -153,6 +153,8 @@ def main() -> None:
     parser.add_argument("--surfaces", default="truth")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    decisive = ("sweeps", "frames", "surfaces")
+    require_same(arguments.out, {name: getattr(arguments, name) for name in decisive})
     kept = arguments.out / "results.jsonl"
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     done = {row["study"] for row in rows}

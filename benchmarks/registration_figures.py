@@ -37,6 +37,7 @@ from registration_studies import (
     found_surfaces,
     make_study,
     miscalibrated,
+    require_same,
     start_of,
     true_surfaces,
 )
@@ -170,6 +171,8 @@ def work(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Do what has not been done yet; all results."""
     path = arguments.out / "results.jsonl"
     arguments.out.mkdir(parents=True, exist_ok=True)
+    decisive = ("surfaces", "phases", "calibration_error", "mr_pixels", "reading")
+    require_same(arguments.out, {name: getattr(arguments, name) for name in decisive})
     results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {(one["study"], one["method"], one["start"]) for one in results}
     products = None if arguments.surfaces == "truth" else Path(arguments.surfaces)
@@ -208,8 +211,7 @@ def result_of(
         measured = peer(order, study, guess)
     else:
         surfaces, cine = _model(order, products, arguments.phases)
-        if arguments.mr_pixels != 1:
-            assert cine is not None, "--mr-pixels needs --surfaces PRODUCTS, which have a cine"
+        if cine is not None and arguments.mr_pixels != 1:
             study, surfaces, cine = with_pixels_wrong(study, surfaces, cine, arguments.mr_pixels)
         known = None if method == "global" else guess
         corrected = "per_sweep" if method == "per_sweep" else "fixed"
@@ -404,7 +406,10 @@ def main() -> None:
     parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")
     parser.add_argument("--reading", choices=["network", "grey"], default="network")
     parser.add_argument("--global", dest="without_start", type=int, default=0)
-    print(tables(work(parser.parse_args())))
+    arguments = parser.parse_args()
+    if arguments.mr_pixels != 1 and arguments.surfaces == "truth":
+        parser.error("--mr-pixels needs --surfaces PRODUCTS, which have a cine")
+    print(tables(work(arguments)))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ drowned in noise afterwards.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,17 @@ from pipeline.registration.correction import tracker_from_picture
 
 SWEEPS, RECORDED = 2, 24
 """How many sweeps are recorded, and frames in each where no study has more."""
+
+
+def require_same(out: Path, asked: dict[str, Any]) -> None:
+    """Refuse to go on in a folder whose results were made otherwise than is asked now."""
+    path = out / "asked.json"
+    if path.exists() and json.loads(path.read_text()) != asked:
+        raise SystemExit(
+            f"{out}: holds results of {path.read_text().strip()}, not of {json.dumps(asked)}; "
+            "choose another folder"
+        )
+    path.write_text(json.dumps(asked) + "\n")
 
 
 @dataclass(frozen=True)

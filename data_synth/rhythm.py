@@ -166,12 +166,16 @@ def draw_rhythm(
     # Even 0.3 of deviation, five times what is usual, leaves the order of waves intact.
     sinus_s = np.maximum(sinus_s, np.maximum(SHORTEST_RR_S, 0.4 * local_s))
     draft = _Draft([-float(local_s[0]) * rng.uniform(2.0, 3.0)])
-    stretch = _fibrillation(settings, duration_s)
+    stretch, begun = _fibrillation(settings), False
     correlated = _pink(rng, len(breath.times_s))
     while draft.times_s[-1] < duration_s + 2 * local_s[-1]:
         now_s = draft.times_s[-1]
         next_s = now_s + float(np.interp(now_s, breath.times_s, sinus_s))
         if stretch is not None and now_s < stretch[1] and next_s >= stretch[0]:
+            if not begun and np.isfinite(stretch[0]):
+                # An early beat and its pause may have run on into the stretch: it begins after.
+                stretch = max(stretch[0], float(np.nextafter(now_s, np.inf))), stretch[1]
+            begun = True
             mean_s = float(np.interp(now_s, breath.times_s, local_s))
             slow = float(np.interp(now_s, breath.times_s, correlated))
             interval_s = _fibrillating_interval_s(rng, mean_s, slow, settings)
@@ -228,7 +232,7 @@ def _coloured(rng: np.random.Generator, count: int, amplitude: Callable[[Float],
     return np.asarray((series / series.std())[:count])
 
 
-def _fibrillation(settings: RhythmSettings, duration_s: float) -> tuple[float, float] | None:
+def _fibrillation(settings: RhythmSettings) -> tuple[float, float] | None:
     """The stretch of fibrillation; the whole record and its margins if none is named."""
     if not settings.fibrillation:
         return None

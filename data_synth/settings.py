@@ -100,12 +100,14 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     if path is not None:
         try:
             with path.open("rb") as stream:
-                content = yaml.load(stream, _Loader) or {}
+                content = yaml.load(stream, _Loader)
         except FileNotFoundError as error:
             raise SynthError(f"{path}: no such file; see configs/phantoms for some") from error
         except (OSError, yaml.YAMLError) as error:
             raise SynthError(f"{path}: cannot be read as YAML settings ({error})") from error
     where = str(path) if path is not None else "settings"
+    # A file of comments alone asks for nothing.
+    content = {} if content is None else content
     if not isinstance(content, dict):
         raise SynthError(f"{where}: needs keys and values, such as `spread: 1.0`")
     return check_settings({**content, **(changes or {})}, where)

@@ -135,6 +135,8 @@ def publishing(target: Path) -> Iterator[Path]:
             target.rename(old)
         partial.rename(target)
     except OSError as error:
+        if old.exists() and not target.exists():
+            old.rename(target)
         raise SynthError(
             f"{target}: cannot be written ({error.strerror}: {error.filename}); "
             "mend the place or choose another"

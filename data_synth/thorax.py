@@ -112,7 +112,7 @@ def lung(x: float, y: float, chest: Thorax) -> int:
 
 
 @compiled
-def cage(x: float, y: float, z: float, depth: float, chest: Thorax) -> int:
+def cage(y: float, z: float, depth: float, chest: Thorax) -> int:
     """Ribs between muscle: flat bars that slope down to the front; ``depth`` mm into the cage."""
     place = (z - RIB_SLOPE * y) / RIB_PITCH_MM
     tall = (place - math.floor(place) - 0.5) * RIB_PITCH_MM / 6.5
@@ -197,7 +197,7 @@ def chest_at(x: float, y: float, z: float, chest: Thorax) -> int:
     if depth < 0:
         return MUSCLE
     if depth < chest.rib_cage:
-        return cage(x, y, z, depth, chest)
+        return cage(y, z, depth, chest)
     roof = diaphragm(x, y, chest)
     return belly(x, y, z, outer, roof, chest) if z < roof else lung(x, y, chest)
 

@@ -1,6 +1,7 @@
 """The command line: the only part that prints (with `pipeline.console`) and ends the program.
 
-Exit codes: 0 done, 1 a stage failed, 2 the input or the command is wrong, 130 interrupted.
+Exit codes: 0 done, 1 a stage failed, 2 the input or the command is wrong, 130 interrupted, 141
+nobody reads what is printed any more.
 Heavy libraries are imported inside the commands, so that ``--help`` answers at once.
 """
 
@@ -33,7 +34,7 @@ app = App(
     help=HELP,
     help_format="plaintext",
     result_action="return_value",
-    # Said by `_guarded`, in the program's own words.
+    # Said by `guarded`, in the program's own words.
     suppress_keyboard_interrupt=False,
 )
 

@@ -116,7 +116,12 @@ def _swap(partial: Path, target: Path) -> None:
     old = target.with_name(f".{target.name}{PARTIAL}old-{os.getpid()}")
     if target.exists():
         target.rename(old)
-    partial.rename(target)
+    try:
+        partial.rename(target)
+    except OSError:
+        if old.exists():
+            old.rename(target)
+        raise
     remove(old)
 
 

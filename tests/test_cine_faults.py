@@ -109,6 +109,10 @@ def test_a_heart_that_never_moves_is_refused() -> None:
     cine.intensity[1] = cine.intensity[0]
     with pytest.raises(InputError, match="here: all phases show the same images"):
         require_different_images(cine, "here")
+    # A padded slice does not make it beat.
+    cine.intensity[:, 0] = 0
+    with pytest.raises(InputError, match="here: all phases show the same images"):
+        require_different_images(cine, "here")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

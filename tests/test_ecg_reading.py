@@ -237,6 +237,15 @@ def test_truncated_dicom_waveform_is_refused(tmp_path):
         read_ecg(write_dicom(tmp_path / "ecg.dcm", [group]))
 
 
+@pytest.mark.parametrize("name", ["NumberOfWaveformSamples", "SamplingFrequency"])
+@pytest.mark.parametrize("empty", [True, False])
+def test_a_dicom_waveform_without_what_tells_its_times_is_refused(tmp_path, name, empty):
+    group = waveform_group(STEPS_UV, "uV")
+    setattr(group, name, None) if empty else delattr(group, name)
+    with pytest.raises(InputError, match="cannot be decoded"):
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", [group]))
+
+
 def test_truncated_dicom_file_is_refused(tmp_path):
     path = write_dicom(tmp_path / "ecg.dcm")
     path.write_bytes(path.read_bytes()[:-700])

@@ -134,4 +134,18 @@ def test_paroxysm_stays_in_its_stretch():
     inside = (signal.r_times_s >= 20.0) & (signal.r_times_s < 40.0)
     assert [kind == "fibrillation" for kind in signal.kinds] == inside.tolist()
     assert signal.fibrillation_s == ((20.0, 40.0),)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_nothing_but_fibrillation_lies_within_its_stretch(seed):
+    """Early beats in pairs run on into it; then it begins behind them."""
+    signal = record(
+        seed=seed, fibrillation=True, fibrillation_s=(20.0, 40.0), ectopic_pattern="bigeminy"
+    )
+    ((start_s, end_s),) = signal.fibrillation_s
+    assert 20.0 <= start_s < 22.5
+    within = (signal.r_times_s >= start_s) & (signal.r_times_s < end_s)
+    kinds = {kind for kind, one in zip(signal.kinds, within, strict=True) if one}
+    assert kinds <= {"fibrillation", "premature_ventricular"}
+    assert "fibrillation" in kinds
     assert np.diff(signal.r_times_s).min() >= 0.25

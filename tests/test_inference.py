@@ -18,7 +18,7 @@ def test_blending_is_the_cyclic_low_pass_that_its_formula_says(count, share):
     mean = 1 - 2 * share + 2 * share * np.cos(2 * np.pi * np.fft.fftfreq(count))
     kept = (2 * mean - mean**2)[:, None, None, None, None]
     expected = np.fft.ifft(kept * np.fft.fft(value, axis=0), axis=0).real
-    blend_phases(value, share)
+    blend_phases(value, share, np.arange(count) / count)
     np.testing.assert_allclose(value, expected, atol=1e-6)
 
 
@@ -31,7 +31,7 @@ def test_blending_leaves_the_turn_at_end_systole_where_it_is():
         0.5 + 0.1 * (-1) ** time,
     )
     parabola = value[2:10, 0, 0].copy()
-    blend_phases(value, 0.25)
+    blend_phases(value, 0.25, np.arange(len(value)) / len(value))
     np.testing.assert_allclose(value[2:10, 0, 0], parabola, atol=1e-6)
     np.testing.assert_allclose(value[:, 0, 1], 0.5, atol=1e-6)
 
@@ -39,8 +39,21 @@ def test_blending_leaves_the_turn_at_end_systole_where_it_is():
 def test_blending_leaves_no_probability_below_nothing():
     value = np.zeros((6, 1, 1, 1, 1), np.float32)
     value[0] = 1
-    blend_phases(value, 0.25)
+    blend_phases(value, 0.25, np.arange(len(value)) / len(value))
     np.testing.assert_allclose(value.ravel(), [0.625, 0.25, 0, 0, 0, 0.25], atol=1e-7)
+
+
+def test_blending_mixes_nothing_across_a_gap_of_the_beat():
+    """Phases of a scanner that stops at 0.76 of the beat; the heart is elsewhere when it starts."""
+    phases = 0.76 * np.arange(20) / 19
+    value = np.cos(2 * np.pi * phases).astype(np.float32)[:, None, None, None, None] + 2
+    blended = value.copy()
+    blend_phases(blended, 0.25, phases)
+    beside = [0, 1, 18, 19]
+    np.testing.assert_array_equal(blended[beside], value[beside])
+    # Elsewhere a cosine loses share^2 (2 - 2 cos(step))^2 of itself.
+    kept = 1 - 0.25**2 * (2 - 2 * np.cos(2 * np.pi * 0.04)) ** 2
+    np.testing.assert_allclose(blended[2:18] - 2, kept * (value[2:18] - 2), atol=1e-6)
 
 
 RIGHT = [LABELS["right_atrium"], LABELS["rv_cavity"]]

@@ -48,6 +48,8 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("mr: {snrr: 20}", r"mr\.snrr: unknown key; did you mean snr\?"),
         ("pathologie: infarct", r"unknown key; did you mean pathology\?"),
         ("- 1", "keys and values"),
+        ("[]", "keys and values"),
+        ("false", "keys and values"),
         ("mr: [", "cannot be read as YAML"),
         ("mr: !!map foo", "cannot be read as YAML"),
     ],

@@ -320,6 +320,25 @@ def test_killed_while_writing_leaves_the_old_product_and_is_cleared_away(tmp_pat
         assert not list(tmp_path.glob(f".*{PARTIAL}*"))
 
 
+def test_a_swap_that_fails_half_way_leaves_the_old_product(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, rename = tmp_path / "stage", Path.rename
+    with publishing(target) as folder:
+        (folder / "text").write_text("old")
+
+    def refused(path: Path, to: Path) -> Path:
+        if to == target and "old-" not in path.name:
+            raise OSError(errno.EACCES, "Permission denied", str(path))
+        return rename(path, to)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(InputError, match="cannot be written"), publishing(target) as folder:
+        (folder / "text").write_text("new")
+    assert (target / "text").read_text() == "old"
+    assert not list(tmp_path.glob(f".*{PARTIAL}*"))
+
+
 def test_a_refusal_of_the_system_is_noticed_whatever_writes(tmp_path: Path) -> None:
     """The system refuses files over 100 kB: every writer of products must hear of it."""
     script = (

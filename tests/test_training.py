@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs the extra 'train'")
 pytest.importorskip("onnx", reason="training needs the extra 'train'")
 
+from data_synth.errors import SynthError  # noqa: E402
 from data_synth.population import draw_heart  # noqa: E402
 from data_synth.tissue import COUNTED_AS, TRUTH_LABELS, Tissue  # noqa: E402
 from data_synth.training.__main__ import main  # noqa: E402
@@ -408,6 +409,8 @@ def test_pool_is_filled_once_and_kept(tmp_path, monkeypatch):
     assert paths[:2] == first
     assert told == [(3, 3)]
     assert np.load(paths[2]).max() == 2
+    with pytest.raises(SynthError, match="spread"):
+        fill_pool(tmp_path, PoolSettings(hearts=3, spread=2.0))
 
 
 def test_command_line_leaves_a_network(tmp_path, capsys):

@@ -276,6 +276,13 @@ def test_frames_that_are_not_2d_are_refused(tmp_path, shape):
         read_sweep(write(tmp_path / "s.mha", good_fields(), np.zeros(shape, np.uint8)))
 
 
+def test_pixels_that_are_no_numbers_are_refused_by_frame(tmp_path):
+    spoilt = PIXELS.astype(np.float32)
+    spoilt[1, 2, 3] = np.nan
+    with pytest.raises(InputError, match="frame 1 has pixels that are no numbers"):
+        read_sweep(write(tmp_path / "s.mha", good_fields(), spoilt))
+
+
 def test_frames_one_pixel_thick_are_frames(tmp_path):
     path = write(tmp_path / "s.mha", good_fields(), PIXELS[:, None])
     np.testing.assert_array_equal(read_sweep(path).images, PIXELS)

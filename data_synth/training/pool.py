@@ -7,6 +7,7 @@ step draws new images from it. A block is a stack of thin parallel planes in a f
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from data_synth.errors import SynthError
 from data_synth.heart import BeatingHeart
 from data_synth.pathology import PATHOLOGIES
 from data_synth.population import draw_heart
@@ -138,8 +140,18 @@ def fill_pool(
     """Write the hearts that the folder lacks, one file each; return all files in order.
 
     Each of ``workers`` processes draws whole hearts; their number changes no byte.
+
+    Raises
+    ------
+    SynthError
+        When the folder's hearts were drawn with another spread or number of blocks.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    note = folder / "pool.json"
+    asked = {"blocks_per_heart": settings.blocks_per_heart, "spread": settings.spread}
+    if note.exists() and (drawn_with := json.loads(note.read_text())) != asked:
+        raise SynthError(f"{folder}: its hearts were drawn with {drawn_with}, not {asked}")
+    note.write_text(json.dumps(asked) + "\n")
     paths = [
         folder / f"seed{settings.seed}_heart{number:04d}.npy" for number in range(settings.hearts)
     ]

@@ -7,7 +7,6 @@ of the baked field, or nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -26,6 +25,7 @@ from pipeline.field.files import map_phase, read_metadata, readable_in_fours
 from pipeline.field.fixture import DEVICES, DeviceName, Fixture
 from pipeline.field.reader import ForceField
 from pipeline.field.spline import grid_numbers, timeline
+from pipeline.field.threads import processors
 from pipeline.field.tool import Needle, Polyline, Torus
 from pipeline.geometry import Float
 from pipeline.progress import Progress
@@ -131,6 +131,8 @@ class Room:
         self.field = ForceField.open(path)
         self.structure = structure
         metadata = read_metadata(path)
+        if structure not in metadata.structures:
+            raise InputError(f"{path}: has no {structure}; it has {', '.join(metadata.structures)}")
         part = path / metadata.structures[structure].spline
         grid = self.field.grid
         # The spline's weights sum to one: coefficients less the lift are those of the surface that
@@ -315,7 +317,7 @@ def run_all(
 
     # The first of all compiles, so that threads do not.
     one(jobs[0])
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    with ThreadPoolExecutor(max_workers=processors()) as pool:
         for done, _ in enumerate(pool.map(one, jobs[1:]), start=2):
             if progress:
                 progress(done, len(jobs))

@@ -144,7 +144,7 @@ def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ig
         ax, ay, az = lists[depth, 3, k], lists[depth, 4, k], lists[depth, 5, k]
         bx, by, bz = lists[depth, 6, k], lists[depth, 7, k], lists[depth, 8, k]
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        u, v, w = dx * ax + dy * ay + dz * az, dx * bx + dy * by + dz * bz, 0.0
+        u, v = dx * ax + dy * ay + dz * az, dx * bx + dy * by + dz * bz
         w = dx * nx + dy * ny + dz * nz
         half_u, half_v, half_w = lists[depth, 9, k], lists[depth, 10, k], lists[depth, 11, k]
         least = np.float32(np.inf)

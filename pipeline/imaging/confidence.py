@@ -70,12 +70,13 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     known = large | np.roll(large, 1, axis=0) | np.roll(large, -1, axis=0)
     confidence *= np.where(known, _ramp(overlap, OVERLAP), 1)
     step = neighbour_steps(found.view.slice_step_mm)
-    if step * found.view.slice_step_mm > FARTHEST_MM:
+    if step * found.view.slice_step_mm > FARTHEST_MM or step >= confidence.shape[1]:
         return confidence
     alike = _ramp(_best_in_space(images, step), ALIKE_IN_SPACE)
     # At an end there is one neighbour alone, and a slice that grazes the tip resembles nothing.
-    alike[:, :step] = (1 + alike[:, :step]) / 2
-    alike[:, -step:] = (1 + alike[:, -step:]) / 2
+    number = np.arange(alike.shape[1])
+    end = (number < step) | (number >= len(number) - step)
+    alike[:, end] = (1 + alike[:, end]) / 2
     confidence *= alike
     overlap = _best_overlap_in_space(heart, step)
     return np.asarray(confidence * np.where(large, _ramp(overlap, OVERLAP), 1))

@@ -272,8 +272,8 @@ def _read_dicom(path: Path) -> Ecg:
     if not groups:
         raise InputError(f"{path}: DICOM without WaveformSequence; it needs an ECG waveform object")
     # Resting ECGs carry the recording and, beside it, a short averaged beat.
-    index = max(range(len(groups)), key=lambda k: int(groups[k].NumberOfWaveformSamples))
-    return _dicom_group(dataset, index, path)
+    lengths = [int(group.get("NumberOfWaveformSamples") or 0) for group in groups]
+    return _dicom_group(dataset, int(np.argmax(lengths)), path)
 
 
 def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
@@ -286,7 +286,9 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
         rate_hz = float(group.SamplingFrequency)
         names = tuple(_lead_name(channel) for channel in channels)
         units = [str(c.ChannelSensitivityUnitsSequence[0].CodeValue) for c in channels]
-    except (AttributeError, ValueError, IndexError, KeyError, NotImplementedError) as error:
+    except (
+        AttributeError, TypeError, ValueError, IndexError, KeyError, NotImplementedError
+    ) as error:  # fmt: skip
         raise InputError(
             f"{path}: the waveform cannot be decoded ({error}); it needs complete samples, a "
             "sampling frequency, and a source and a unit for each channel; export it again"

@@ -136,11 +136,11 @@ def _numbered(cine: Cine) -> Integer:
 
 
 def _equal_columns(which: Integer) -> list[tuple[int, int]]:
-    """Pairs of columns that are the same all along, and nowhere blank."""
+    """Pairs of columns that are the same all along, and not blank all along."""
     return [
         (one, other)
         for one, other in combinations(range(which.shape[1]), 2)
-        if (which[:, one] == which[:, other]).all() and (which[:, one] >= 0).all()
+        if (which[:, one] == which[:, other]).all() and (which[:, one] >= 0).any()
     ]
 
 

@@ -242,10 +242,21 @@ def _beats(frame: Frame) -> float:
 
 def _time_range_ms(frames: Sequence[Frame]) -> tuple[float, float]:
     """First and last time by the attribute that tells the frames furthest apart."""
-    names = set(frames[0].times_ms).intersection(*(frame.times_ms for frame in frames))
-    times_ms = [[frame.times_ms[name] for frame in frames] for name in names] or [[0.0]]
-    widest = max(times_ms, key=np.ptp)
-    return min(widest), max(widest)
+    return max(_time_ranges_ms(frames).values(), key=_span_ms, default=(0.0, 0.0))
+
+
+def _time_ranges_ms(frames: Sequence[Frame]) -> dict[str, tuple[float, float]]:
+    """First and last time by each attribute that all frames have, in the order of the first's."""
+    ranges_ms = {}
+    for name in frames[0].times_ms:
+        if all(name in frame.times_ms for frame in frames):
+            times_ms = [frame.times_ms[name] for frame in frames]
+            ranges_ms[name] = min(times_ms), max(times_ms)
+    return ranges_ms
+
+
+def _span_ms(first_and_last_ms: tuple[float, float]) -> float:
+    return first_and_last_ms[1] - first_and_last_ms[0]
 
 
 def is_stack(frames: Sequence[Frame]) -> bool:
@@ -336,7 +347,13 @@ def _within(series: Sequence[Frame], cine: Sequence[Frame], slices_mm: Float) ->
         for frame in cine
         if np.abs(places_mm - float(frame.middle_mm @ normal)).min() < near_mm
     ]
-    (first_ms, last_ms), (start_ms, end_ms) = _time_range_ms(series), _time_range_ms(beside)
+    own_ms, theirs_ms = _time_ranges_ms(series), _time_ranges_ms(beside)
+    # By one attribute for both: times of acquisition and of triggers count from other moments.
+    shared = [name for name in theirs_ms if name in own_ms]
+    if not shared:
+        return False
+    told = max(shared, key=lambda name: _span_ms(theirs_ms[name]))
+    (first_ms, last_ms), (start_ms, end_ms) = own_ms[told], theirs_ms[told]
     return start_ms <= first_ms and last_ms <= end_ms
 
 

@@ -203,20 +203,32 @@ def settle_tricuspid(value: Float32) -> None:
         value[:, plane, pair[1], rows, columns] = ventricle + spare
 
 
-def blend_phases(value: Float32, share: float) -> None:
-    """Mix each phase with two neighbours on either side in the cycle, in place.
+UNEVEN = 1.5
+"""Times the usual step between phases; where one nearby is longer or shorter by more, a difference
+of the fourth order tells nothing."""
+
+
+def blend_phases(value: Float32, share: float, phases: Float) -> None:
+    """Mix each phase ``(phase,)`` in [0, 1) with two neighbours on either side in the cycle, in
+    place, but beside a gap, as where a scanner stops before the beat ends.
 
     2 B - B B with B the mean in which either neighbour has ``share``; that is, without ``share^2``
     times the fourth difference in time. Where B alone draws what turns back, as volumes do at
     end-systole, short of where it turns, this does not; noise falls as much.
     """
+    steps = np.diff(phases, append=phases[0] + 1)
+    usual = np.median(steps)
+    even = (steps <= UNEVEN * usual) & (UNEVEN * steps >= usual)
+    # Of phase k, the steps from k - 2 to k + 2.
+    amid = np.all([np.roll(even, by) for by in (2, 1, 0, -1)], axis=0)
+    weights = np.where(amid, np.float32(share**2), np.float32(0))
     for plane in range(value.shape[1]):
         # Plane by plane what is at work stays in the processor's cache.
-        _blend(value[:, plane], np.float32(share**2))
+        _blend(value[:, plane], weights)
 
 
-def _blend(value: Float32, weight: np.float32) -> None:
-    """Take ``weight`` times the fourth difference along the first axis off, in place."""
+def _blend(value: Float32, weights: Float32) -> None:
+    """Take ``weights`` times the fourth difference along the first axis off, in place."""
     count = len(value)
     first = value[:2].copy()
     before = [value[-2 % count].copy(), value[-1].copy()]
@@ -227,5 +239,5 @@ def _blend(value: Float32, weight: np.float32) -> None:
             for step in (1, 2)
         ]
         fourth = before[0] + after[1] - 4 * (before[1] + after[0]) + 6 * now
-        np.maximum(now - weight * fourth, 0, out=value[phase])
+        np.maximum(now - weights[phase] * fourth, 0, out=value[phase])
         before = [before[1], now]

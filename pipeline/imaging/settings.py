@@ -34,4 +34,5 @@ class SegmentSettings(BaseModel):
     """Empty space kept around the heart on the isotropic grid."""
 
     correct_shifts: bool = True
-    """Move slices in their plane against breath-hold shifts before they become a volume."""
+    """Move slices against breath-hold shifts before they become a volume: in their plane, and along
+    its normal where long-axis views tell how far."""

@@ -335,6 +335,12 @@ def _grey_frames(path: Path, image: Any, values: Any) -> Any:
         raise InputError(
             f"{path}: has {components} values a pixel; export grey values, one a pixel"
         )
+    spoilt = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+    if len(spoilt):
+        raise InputError(
+            f"{path}: frame {spoilt[0]} has pixels that are no numbers ({len(spoilt)} of "
+            f"{len(values)} frames do); export grey values from 0 to 255"
+        )
     return values
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -105,7 +106,7 @@ def future_work(subject: Subject, seed: int, operators: int, progress: Progress)
 
 
 def _curves(axis: Axes, field: ForceField, x: Float, errors: Callable[[str, int], Float]) -> None:
-    for name, (colour, style) in zip(field.fixtures, LOOKS, strict=False):
+    for name, (colour, style) in zip(field.fixtures, cycle(LOOKS), strict=False):
         values = [errors(name, n) for n in range(len(x))]
         middle = [np.median(one) for one in values]
         high = [np.percentile(one, 95) for one in values]

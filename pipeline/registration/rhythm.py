@@ -72,6 +72,7 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
     step = max(1, round(_STEP_S * sampling_rate_hz))
     found: list[RhythmBeat] = []
     listed, lost_s = False, [-math.inf]
+    end_s = (len(signal_mv) - 1) / sampling_rate_hz
     for start in range(0, len(padded), step):
         beats = detector.push(padded[start : start + step])
         kinds = [tell(clock, beat) for beat in beats]
@@ -83,7 +84,7 @@ def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
             if beat.instead and listed:
                 found.pop()
             last_s = found[-1].time_s if found else math.nan
-            listed = kind is not None and beat.time_s <= (len(signal_mv) - 1) / sampling_rate_hz
+            listed = kind is not None and 0 <= beat.time_s <= end_s
             if kind is not None and listed:
                 whole = not any(last_s < one < beat.time_s for one in lost_s)
                 found.append(_row(beat, kind, valid, beat.time_s - last_s if whole else math.nan))

@@ -137,7 +137,7 @@ class RPeakDetector:
         Raises
         ------
         InputError
-            When the number of leads is another, or a sample no number.
+            When the number of leads is another, or samples are words. Samples may be NaN: missing.
         """
         try:
             block = np.atleast_2d(np.ascontiguousarray(samples_mv, dtype=np.float64))

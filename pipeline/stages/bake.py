@@ -49,7 +49,7 @@ def run(job: Job) -> dict[str, Any]:
     )
     return {
         "accuracy": certificate,
-        "example": _example(fixtures, surfaces),
+        "example": _example(fixtures, surfaces, job.settings.bake.margin_mm),
         "left_out": left_out,
     }
 
@@ -99,16 +99,17 @@ def fixtures_for(
 
 
 def _example(
-    fixtures: Mapping[str, Fixture], surfaces: Mapping[str, MovingSurface]
+    fixtures: Mapping[str, Fixture], surfaces: Mapping[str, MovingSurface], margin_mm: float
 ) -> dict[str, Any]:
-    """A place to ask for a force: just off the first fixture's surface at the first phase."""
+    """A place to ask for a force: just off the first fixture's surface at the first phase, within
+    the grid."""
     name, fixture = next(iter(fixtures.items()))
     moving = surfaces[fixture.structure]
     vertices_mm = moving.vertices_mm[0]
     centre_mm = vertices_mm.mean(axis=0)
     vertex_mm = vertices_mm[0]
     outward = (vertex_mm - centre_mm) / np.linalg.norm(vertex_mm - centre_mm)
-    point_mm = vertex_mm + fixture.resolved_delta_mm * outward
+    point_mm = vertex_mm + min(fixture.resolved_delta_mm, 0.9 * margin_mm) * outward
     return {
         "fixture": name,
         "point_mm": np.round(point_mm, 1).tolist(),
