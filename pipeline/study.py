@@ -168,7 +168,9 @@ def _is_study(folder: Path) -> bool:
 
 def _require_name_of_description(folder: Path) -> None:
     for path in folder.iterdir():
-        if path.name.lower() in ("study.yml", "study.yaml") and path.name != "study.yaml":
+        # Windows hides the last ending, and editors add it.
+        name = path.name.lower().removesuffix(".txt")
+        if name in ("study.yml", "study.yaml") and path.name != "study.yaml":
             raise InputError(f"{path}: would not be read; rename it to study.yaml")
 
 
@@ -272,8 +274,19 @@ def _found_cine(folder: Path, given: Any) -> Any:
             "put that beside it, or, of DICOM files, take timing.json out"
         )
     timing = images[0].with_name("timing.json") if images else None
+    if timing and "timing" not in given:
+        _require_name_of_timing(timing, folder)
     found = {"timing": timing if timing and timing.exists() else None}
     return {**found, **given, "path": images[0] if images else cine}
+
+
+def _require_name_of_timing(timing: Path, folder: Path) -> None:
+    """Refuse a file that a user took for the cine's timing, and that nothing would read."""
+    for one in [*timing.parent.glob("*.json"), *folder.glob("*.json")]:
+        if "timing" in one.name.lower() and one != timing:
+            raise InputError(
+                f"{one}: would not be read; name it {timing}, or under cine.timing in study.yaml"
+            )
 
 
 def _require_no_dicom(cine: Path, image: Path) -> None:
@@ -369,9 +382,13 @@ def _require_files(study: Study) -> None:
             if stem and header.suffix == ".hea" and header.stem == stem.stem:
                 _require_signals(header)
     if study.us and study.ecg.us is None:
+        beside = sorted(one.relative_to(study.folder).as_posix() for one in
+                        files_below(study.folder / "ecg"))  # fmt: skip
+        there = f" (there are {', '.join(beside[:6])})" if beside else ""
         raise InputError(
-            f"{study.folder}: has tracked ultrasound but no ECG recorded with it; add ecg/us.hea "
-            "with its data, or take us/ out"
+            f"{study.folder}: has tracked ultrasound but no ECG recorded with it{there}; add "
+            "ecg/us.hea with its data, ecg/us.csv or ecg/us.dcm, or name it under ecg.us in "
+            "study.yaml; to go on without the ultrasound write `us: null` there"
         )
     if study.us and study.us.initial_mr_from_tracker:
         start = np.array(study.us.initial_mr_from_tracker, dtype=float)

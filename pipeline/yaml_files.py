@@ -53,8 +53,15 @@ def read_yaml(path: Path) -> Any:
             f"{path}: cannot be read as YAML ({error}); text that looks like a date or a number "
             "needs quotes"
             if isinstance(error, ValueError)
-            else f"{path}: cannot be read as YAML ({error})"
+            else f"{path}: cannot be read as YAML ({error}){_remedy(error)}"
         ) from error
+
+
+def _remedy(error: Exception) -> str:
+    """What to do about text that YAML does not take, where that can be told."""
+    if "'\\t'" in str(error):
+        return "; indent with spaces in the place of tabs"
+    return "; save it as UTF-8" if isinstance(error, yaml.reader.ReaderError) else ""
 
 
 def _content(loader: _Loader, path: Path) -> Any:

@@ -178,6 +178,17 @@ def test_a_folder_copied_into_itself_is_one_stack_and_a_line_a_series(tmp_path: 
     assert all(f"{PHASES} images" in line and "a copy of" in line for line in stack.left_out)
 
 
+def test_images_of_another_modality_are_no_cine(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.2"
+        data.Modality = "CT"
+        return True
+
+    write_dicom(tmp_path, change)
+    with pytest.raises(InputError, match="CT Image Storage, of modality CT"):
+        read_dicom_cine(tmp_path)
+
+
 def test_the_same_cine_as_classic_and_enhanced_objects_is_one_stack(tmp_path: Path) -> None:
     stack = read_dicom_cine(mixed(tmp_path, [enhanced_object(ALL_FRAMES)]))
     assert_is_the_stack(stack)

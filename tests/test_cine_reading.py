@@ -245,6 +245,25 @@ def test_voxels_in_metres_or_micrometres_are_named(tmp_path: Path, unit: float) 
         read_nifti_cine(tmp_path / "cine.nii", None)
 
 
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [([0, 0, 0], "gives a voxel no size"), ([0, 2, 0], "same way")],
+)
+def test_a_placement_that_is_none_is_told_with_the_other(
+    tmp_path: Path, column: list[float], words: str
+) -> None:
+    nifti_cine(tmp_path / "cine.nii", np.diag([1.5, 1.5, 8, 1]))
+    image = nibabel.load(tmp_path / "cine.nii")
+    image.set_qform(image.affine, 1)
+    spoilt = image.affine.copy()
+    spoilt[:3, 0] = column
+    image.header.set_sform(spoilt, 1)
+    image._affine = spoilt
+    nibabel.save(image, tmp_path / "spoilt.nii")
+    with pytest.raises(InputError, match=rf"its sform .*{words}.* set sform_code to 0"):
+        read_nifti_cine(tmp_path / "spoilt.nii", None)
+
+
 def placed(path: Path, sform: int, qform: int, apart_mm: float = 0.0) -> tuple[str, ...]:
     """What is told of a file whose header has these codes, and two placements so far apart."""
     nifti_cine(path / "cine.nii", np.diag([1.5, 1.5, 8, 1]))

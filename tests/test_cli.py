@@ -108,6 +108,7 @@ def test_a_wrong_command_ends_with_exit_code_2(
             "fixtures: fixture name 'a b': needs letters, digits",
         ),
         ("a: [", "cannot be read as YAML"),
+        ("segment:\n\tmost_views: 2\n", "spaces in the place of tabs"),
         ("7", "needs sections"),
     ],
 )

@@ -108,6 +108,14 @@ def test_objects_without_preamble_and_meta_information_are_read(
     assert_is_the_stack(read_dicom_cine(tmp_path))
 
 
+def test_objects_that_lost_their_preamble_alone_are_read(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    for path in tmp_path.rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[132:])
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
 @pytest.mark.parametrize("value", [[4095, 4095], "none"])
 def test_padding_that_is_no_single_number_is_no_padding(tmp_path: Path, value: Any) -> None:
     def change(data: FileDataset, number: int, phase: int) -> bool:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from data_synth.ecg import EcgSettings, simulate_ecg
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.registration.time import detect_r_peaks, median_rr_s, phases_at
+from pipeline.registration.time import detect_r_peaks, doubts_of_rate, median_rr_s, phases_at
 from pipeline.stages.register import _timing
 
 RATE_HZ = 500.0
@@ -265,3 +265,14 @@ def test_detected_peaks_give_the_phantoms_own_phases():
 
 def test_median_rr_is_that_of_the_intervals():
     assert median_rr_s(np.array([0.0, 1.0, 1.8, 3.0])) == pytest.approx(1.0)
+
+
+def test_a_sampling_rate_told_twice_as_low_is_doubted():
+    r_times_s = np.arange(20) * 0.8
+    assert doubts_of_rate(r_times_s, 0.8) == []
+    # A heart that is excited, and one whose pacemaker is off.
+    assert doubts_of_rate(r_times_s * 0.6, 0.8) == doubts_of_rate(r_times_s * 1.7, 0.8) == []
+    (said,) = doubts_of_rate(2 * r_times_s, 0.8)
+    assert "38 times a minute" in said
+    assert "75 times in the MR" in said
+    assert "sampling rate" in said

@@ -107,12 +107,25 @@ def test_an_empty_study_yaml_changes_nothing(tmp_path: Path, text: str) -> None:
     assert open_study(folder) == found
 
 
-@pytest.mark.parametrize("name", ["study.yml", "Study.yaml"])
+@pytest.mark.parametrize("name", ["study.yml", "Study.yaml", "Study.yaml.txt"])
 def test_a_description_under_another_name_is_not_overlooked(tmp_path: Path, name: str) -> None:
     folder = study_folder(tmp_path)
     (folder / name).write_text("patient_id: robot-01\n")
     with pytest.raises(InputError, match=rf"{name}: would not be read; rename it to study\.yaml"):
         open_study(folder)
+
+
+@pytest.mark.parametrize("name", ["cine/cine_timing.json", "timing.json", "cine/Timing.json"])
+def test_timing_under_another_name_is_not_overlooked(tmp_path: Path, name: str) -> None:
+    (tmp_path / "p1" / "cine").mkdir(parents=True)
+    (tmp_path / "p1" / "cine" / "cine.nii.gz").write_bytes(b"0")
+    (tmp_path / "p1" / name).write_text("{}")
+    with pytest.raises(InputError, match=f"{name}: would not be read; name it .*cine/timing.json"):
+        open_study(tmp_path / "p1")
+    (tmp_path / "p1" / "study.yaml").write_text(f"cine: {{timing: {name}}}\n")
+    timing = open_study(tmp_path / "p1").cine.timing
+    assert timing is not None
+    assert timing.samefile(tmp_path / "p1" / name)
 
 
 def test_a_study_may_have_no_ecg_at_all(tmp_path: Path) -> None:

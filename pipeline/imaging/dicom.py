@@ -164,6 +164,9 @@ def _other_object(dataset: Any) -> str | None:
     name = MR_CLASSES.get(sop_class) or pydicom.uid.UID(sop_class).name
     if "PixelData" not in dataset:
         return None if sop_class in MR_CLASSES else f"{name}, no image"
+    modality = str(dataset.get("Modality", "") or "MR")
+    if modality != "MR" and sop_class not in MR_CLASSES:
+        return f"{name}, of modality {modality}"
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"
     placed = "ImagePositionPatient" in dataset or "PerFrameFunctionalGroupsSequence" in dataset
@@ -227,9 +230,11 @@ def _frame(
     axes = group("PlaneOrientationSequence").get("ImageOrientationPatient")
     spacing = group("PixelMeasuresSequence").get("PixelSpacing")
     if not corner or not axes or not spacing:
+        told = {"ImagePositionPatient": corner, "ImageOrientationPatient": axes}
+        lacking = [name for name, value in {**told, "PixelSpacing": spacing}.items() if not value]
         raise InputError(
-            f"{where}: has no ImagePositionPatient, ImageOrientationPatient or PixelSpacing; "
-            "export the original images, not screen captures"
+            f"{where}: has no {' and no '.join(lacking)}; export the original images, not screen "
+            "captures"
         )
     try:
         timing = group("CardiacSynchronizationSequence")

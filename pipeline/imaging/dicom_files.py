@@ -33,6 +33,9 @@ VIEWERS = (
 BARE_BEGINNINGS = tuple(bytes((element, 0)) for element in (0x00, 0x01, 0x05, 0x08, 0x12, 0x16))
 """Elements of group 0008 that an object may begin with: its length, CharacterSet, ImageType, ..."""
 
+META_BEGINNINGS = tuple(bytes((element, 0)) for element in (0x00, 0x01, 0x02))
+"""Elements of group 0002 that it may begin with: its length, its version, class of the object."""
+
 TEXT_BYTES = 4096
 """Of a file without an ending, these many tell whether it is text, as a disc's README."""
 
@@ -89,7 +92,9 @@ def _begins_as_dicom(path: Path) -> bool:
 
 def is_bare(path: Path) -> bool:
     """Whether a file begins with a DICOM object itself, as old archives store them: without
-    preamble and file meta information, its first elements those of group 0008."""
+    preamble, its first elements those of group 0008, or of the file meta information."""
     with path.open("rb") as handle:
         group, element = handle.read(2), handle.read(2)
+    if group == b"\x02\x00":
+        return element in META_BEGINNINGS
     return group == b"\x08\x00" and element in BARE_BEGINNINGS

@@ -216,12 +216,32 @@ def _load(path: Path) -> Any:
     return image
 
 
+def _placement_name(image: Any) -> str:
+    """Which of a header's placements is taken."""
+    return "sform" if image.header["sform_code"] > 0 else "qform"
+
+
+def _other_placement(image: Any) -> str:
+    """What to do about a placement that is none."""
+    if image.header["sform_code"] > 0 and image.header["qform_code"] > 0:
+        return "its qform may be right: set sform_code to 0, or write the qform into the sform"
+    return "convert the scanner's own files again"
+
+
 def _right_angled_affine(image: Any, path: Path) -> Float:
     affine: Float = np.asarray(image.affine, dtype=float)
     lengths = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or not (lengths > 0).all():
-        raise InputError(f"{path}: its affine is not a placement in space:\n{affine}")
+        raise InputError(
+            f"{path}: its {_placement_name(image)} gives a voxel no size, or holds what is no "
+            f"number: {np.round(affine[:3], 3).tolist()}; {_other_placement(image)}"
+        )
     axes = affine[:3, :3] / lengths
+    if np.linalg.matrix_rank(axes, tol=1e-3) < 3:
+        raise InputError(
+            f"{path}: two axes of its {_placement_name(image)} point the same way: "
+            f"{np.round(affine[:3], 3).tolist()}; {_other_placement(image)}"
+        )
     lean = np.abs(axes.T @ axes - np.eye(3)).max()
     # Single-precision affines of oblique stacks are right-angled to about 1e-6.
     if lean > 1e-3:
@@ -325,7 +345,9 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from error
+        raise InputError(
+            f"{path}: cannot be read as JSON ({error}); write it as docs/study.md shows, in UTF-8"
+        ) from error
     if not isinstance(content, dict) or not {"trigger_times_ms", "rr_ms"} <= set(content):
         found = ", ".join(content) if isinstance(content, dict) else repr(content)
         evenly = ""

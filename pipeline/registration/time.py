@@ -14,6 +14,9 @@ from pipeline.geometry import Float
 from pipeline.registration.clock import to_cycle
 from pipeline.registration.rpeaks import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, find_beats, is_fit_rate
 
+OTHER_RATE = 1.8
+"""Times by which one heart may beat faster or slower in another examination. A record told at twice
+its sampling rate, or half, is beyond."""
 _SHORTEST_RECORD_S = 3.0
 # Three years, which no recording lasts: such times are counted from 1970.
 _SINCE_1970_S = 1e8
@@ -135,6 +138,19 @@ def median_rr_s(r_times_s: Float) -> float:
             f"({(~(rr_s > 0)).sum()} of them not after the one before)"
         )
     return float(np.median(rr_s))
+
+
+def doubts_of_rate(r_times_s: Float, cycle_rr_s: float) -> list[str]:
+    """A sentence where the ultrasound's heart beats so much faster or slower than the MR's, whose
+    interval is ``cycle_rr_s``, that one of the two is told wrongly; else none."""
+    rr_s = median_rr_s(r_times_s)
+    if 1 / OTHER_RATE <= rr_s / cycle_rr_s <= OTHER_RATE:
+        return []
+    return [
+        f"the heart beats {60 / rr_s:.0f} times a minute in the ultrasound's ECG and "
+        f"{60 / cycle_rr_s:.0f} times in the MR: is the record's sampling rate right, and are both "
+        "of one patient?"
+    ]
 
 
 def _require_record(signal_mv: Float, sampling_rate_hz: float) -> None:

@@ -23,7 +23,7 @@ from pipeline.products import (
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import Registration, register, require_frames
-from pipeline.registration.time import detect_r_peaks, median_rr_s, phases_at
+from pipeline.registration.time import detect_r_peaks, doubts_of_rate, median_rr_s, phases_at
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on how a study's folder is understood.
@@ -41,7 +41,8 @@ def run(job: Job) -> dict[str, Any]:
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle["rr_s"])
-    found = _registered(job, sweeps, timing, surfaces, start)
+    doubts = [*_doubts_of_images(job), *doubts_of_rate(r_times_s, cycle["rr_s"])]
+    found = _registered(job, sweeps, timing, surfaces, start, doubts)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found), sweeps[0].pose_frame)
     return {
@@ -94,10 +95,11 @@ def _registered(
     timing: Timing,
     surfaces: dict[str, MovingSurface],
     start: Float | None,
+    doubts: list[str],
 ) -> Registration:
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
-    cine, doubts = read_cine(job.products / "ingest"), _doubts_of_images(job)
+    cine = read_cine(job.products / "ingest")
     known = start, settings, job.progress, timing, cine, doubts
     try:
         return register(sweeps, phases, surfaces, *known)
