@@ -82,6 +82,8 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         *_timing(ingest),
         *[("input", text) for text in ingest.get("remarks", [])],
+        *_drawn_between(ingest),
+        *_series_left_out(ingest),
         *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
         *_orientation(segment),
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
@@ -100,6 +102,29 @@ def _timing(ingest: dict[str, Any]) -> list[tuple[str, str]]:
             "all that tells; write timing.json if that is not so",
         )
     ]
+
+
+def _drawn_between(ingest: dict[str, Any]) -> list[tuple[str, str]]:
+    numbers = ", ".join(map(str, ingest.get("interpolated_slices", [])))
+    return [("input", f"slices {numbers} are drawn between their neighbours")] if numbers else []
+
+
+def _series_left_out(ingest: dict[str, Any]) -> list[tuple[str, str]]:
+    unused = series_left_out(ingest)
+    if not unused:
+        return []
+    others = f", and {len(unused) - 1} more that the report names" if len(unused) > 1 else ""
+    return [("left out", f"of the cine's folder {unused[0]}{others}")]
+
+
+def series_left_out(ingest: dict[str, Any]) -> list[str]:
+    """Series of the cine's folder of which nothing is made, neither the stack nor a long-axis view.
+
+    >>> series_left_out({"left_out": ["a: scout", "b: across"], "long_axis": ["b"]})
+    ['a: scout']
+    """
+    views = tuple(f"{name}:" for name in ingest.get("long_axis", []))
+    return [text for text in ingest.get("left_out", []) if not text.startswith(views)]
 
 
 def _orientation(segment: dict[str, Any]) -> list[tuple[str, str]]:

@@ -20,6 +20,7 @@ from pipeline.report.animation import _webp, first_frame
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, render
 from pipeline.stages.report import _of_whole_ventricles, _opening, _registration_notes
+from pipeline.summary import remarks
 
 
 def notes(us: object, figures: dict[str, Any] | None) -> list[str]:
@@ -93,6 +94,18 @@ def test_the_page_begins_with_what_the_field_is_worth(
     said = opening(us, verdict, doubtful, truth=True)
     assert said.headline.startswith(headline)
     assert any("not for use on patients" in text for text in said.told)
+
+
+def test_what_of_the_folder_is_not_used_is_told_in_one_line() -> None:
+    ingest = {
+        "left_out": ["series 3: scout", "series 17: across", "series 9: a report"],
+        "long_axis": ["series 17"],
+        "interpolated_slices": [4],
+    }
+    assert remarks({"ingest": {"status": "done", "figures": ingest}}) == [
+        ("input", "slices 4 are drawn between their neighbours"),
+        ("left out", "of the cine's folder series 3: scout, and 1 more that the report names"),
+    ]
 
 
 @pytest.mark.parametrize("truth", [False, True])

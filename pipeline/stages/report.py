@@ -25,7 +25,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
-from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts
+from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts, series_left_out
 
 ULTRASOUND_FRAMES_SHOWN = 4
 BLOOD_TOLD = (
@@ -142,6 +142,8 @@ def _opening(job: Job) -> Opening:
         )
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
+    unused = series_left_out(job.figures("ingest"))
+    told += [f"Of the cine's folder nothing is made of {text}." for text in unused]
     return Opening(f"{where} {found}", warnings, told)
 
 
