@@ -7,6 +7,14 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+PLAIN = {
+    **dict.fromkeys(("tuple_type", "list_type"), "needs a list, such as [first, second]"),
+    **dict.fromkeys(("float_parsing", "float_type"), "needs a number"),
+    **dict.fromkeys(("int_parsing", "int_type", "int_from_float"), "needs a whole number"),
+    **dict.fromkeys(("bool_parsing", "bool_type"), "needs true or false"),
+}
+"""What the library's kinds of error ask for, in words."""
+
 
 def describe_validation(
     error: ValidationError,
@@ -41,6 +49,11 @@ def describe_validation(
             message = "needs text; put it in quotes"
         elif one["type"] == "string_pattern_mismatch":
             message = "needs letters, digits and '_ . -' alone, a letter or digit first"
+        elif one["type"] in PLAIN:
+            message = PLAIN[one["type"]]
+        elif one["type"] in ("too_short", "too_long"):
+            needed = one["ctx"].get("min_length", one["ctx"].get("max_length"))
+            message = f"needs {needed} entries, not {one['ctx']['actual_length']}"
         came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
         lines.append(f"{where}: {key}: {message}{came}")
     return "\n".join(lines)
