@@ -59,6 +59,13 @@ def a_job(settings, mirror_image=False):
     )
 
 
+def timing_of(recording, cycle_rr_s):
+    """Of a heart that beats every 0.8 s."""
+    return SimpleNamespace(
+        phases=lambda: recording.phases, r_times_s=0.8 * np.arange(9), cycle_rr_s=cycle_rr_s
+    )
+
+
 class TestRegister:
     @pytest.mark.parametrize("seed", [0, 1, 2])
     def test_pose_is_found_from_15_mm_and_15_degrees_away(self, surfaces, recording, seed):
@@ -250,7 +257,7 @@ class TestRefusals:
         monkeypatch.setattr(stage, "read_cine", lambda _: None)
         settings = RegisterSettings(on_failure=on_failure)
         job = a_job(settings)
-        timing = SimpleNamespace(phases=lambda: recording.phases)
+        timing = timing_of(recording, 0.8)
         near = np.tile(np.eye(4), (14, 1, 1))
         near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
         poses = recording.sweeps[0].tracker_from_image
@@ -272,7 +279,7 @@ class TestRefusals:
 
         monkeypatch.setattr(stage, "register", found)
         monkeypatch.setattr(stage, "read_cine", lambda _: None)
-        timing = SimpleNamespace(phases=lambda: recording.phases)
+        timing = timing_of(recording, 0.8)
         job = a_job(RegisterSettings(), mirror_image)
         told = stage._registered(job, [], timing, {}, None)
         assert bool(told) == mirror_image
@@ -281,6 +288,13 @@ class TestRefusals:
         result = register(*given, QUICK, doubts=told)
         assert (result.verdict == "good") != mirror_image
         assert ("a mirror image" in result.reason) == mirror_image
+
+    def test_a_heart_of_another_rate_is_never_good(self, monkeypatch, recording):
+        monkeypatch.setattr(stage, "register", lambda *given: given[-1])
+        monkeypatch.setattr(stage, "read_cine", lambda _: None)
+        job = a_job(RegisterSettings())
+        (doubt,) = stage._registered(job, [], timing_of(recording, 1.6), {}, None)
+        assert "75 times a minute in the ultrasound's ECG and 38 times in the MR" in doubt
 
     def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
         sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))

@@ -41,8 +41,7 @@ def run(job: Job) -> dict[str, Any]:
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle["rr_s"])
-    doubts = [*_doubts_of_images(job), *doubts_of_rate(r_times_s, cycle["rr_s"])]
-    found = _registered(job, sweeps, timing, surfaces, start, doubts)
+    found = _registered(job, sweeps, timing, surfaces, start)
     phases = timing.phases(found.clock.applied_s if found.clock else 0.0)
     _write(job, found, _rows(sweeps, phases, found), sweeps[0].pose_frame)
     return {
@@ -95,11 +94,11 @@ def _registered(
     timing: Timing,
     surfaces: dict[str, MovingSurface],
     start: Float | None,
-    doubts: list[str],
 ) -> Registration:
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
     cine = read_cine(job.products / "ingest")
+    doubts = [*_doubts_of_images(job), *_doubts_of_rate(timing)]
     known = start, settings, job.progress, timing, cine, doubts
     try:
         return register(sweeps, phases, surfaces, *known)
@@ -142,6 +141,12 @@ def _doubts_of_images(job: Job) -> list[str]:
         "the MR's images are a mirror image of what their header says, to which no tracker's pose "
         "fits: look at the order of the slices and the orientation in the file"
     ]
+
+
+def _doubts_of_rate(timing: Timing) -> list[str]:
+    if timing.cycle_rr_s is None:
+        return []
+    return doubts_of_rate(timing.r_times_s, timing.cycle_rr_s)
 
 
 def _r_times_s(study: Study, ecg: Ecg) -> Float:
