@@ -164,8 +164,9 @@ def _other_object(dataset: Any) -> str | None:
     name = MR_CLASSES.get(sop_class) or pydicom.uid.UID(sop_class).name
     if "PixelData" not in dataset:
         return None if sop_class in MR_CLASSES else f"{name}, no image"
+    # OT is what programs call images that they convert, of any origin.
     modality = str(dataset.get("Modality", "") or "MR")
-    if modality != "MR" and sop_class not in MR_CLASSES:
+    if modality not in ("MR", "OT") and sop_class not in MR_CLASSES:
         return f"{name}, of modality {modality}"
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"

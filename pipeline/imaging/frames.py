@@ -351,7 +351,8 @@ def _within(series: Sequence[Frame], cine: Sequence[Frame], slices_mm: Float) ->
     # By one attribute for both: times of acquisition and of triggers count from other moments.
     shared = [name for name in theirs_ms if name in own_ms]
     if not shared:
-        return False
+        # Without any time it is no piece of a cine that has them.
+        return not own_ms
     told = max(shared, key=lambda name: _span_ms(theirs_ms[name]))
     (first_ms, last_ms), (start_ms, end_ms) = own_ms[told], theirs_ms[told]
     return start_ms <= first_ms and last_ms <= end_ms
