@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from pipeline.errors import InputError
 from pipeline.field.fixture import DEFAULT_FIXTURES, BakeSettings, Fixture
@@ -13,14 +13,12 @@ from pipeline.field.metadata import require_name
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.registration.settings import RegisterSettings
 from pipeline.surface.settings import SurfaceSettings
-from pipeline.validation import describe_validation
+from pipeline.validation import Section, describe_validation
 from pipeline.yaml_files import read_yaml
 
 
-class Settings(BaseModel):
+class Settings(Section):
     """Everything that a user can set."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     segment: SegmentSettings = SegmentSettings()
     surface: SurfaceSettings = SurfaceSettings()

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
 from pipeline.publish import sha256_of
 from pipeline.regular_files import require_no_device
 from pipeline.study_files import files_below, names_in_header, record_files, sweep_files
-from pipeline.validation import describe_validation
+from pipeline.validation import Section, describe_validation
 from pipeline.yaml_files import read_yaml
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
@@ -36,11 +36,7 @@ MEANT = {"us": ("ultrasound", "sweeps"), "ecg": ("ekg", "ecgs")}
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class CineFiles(_Section):
+class CineFiles(Section):
     """The cine MR: a folder of DICOM files, or one 4D NIfTI file."""
 
     path: Path
@@ -59,14 +55,14 @@ class CineFiles(_Section):
     of both neighbours stands in for each."""
 
 
-class EcgFiles(_Section):
+class EcgFiles(Section):
     """ECG records during MR and during ultrasound; WFDB records are named by their stem."""
 
     mr: Path | None = None
     us: Path | None = None
 
 
-class UltrasoundFiles(_Section):
+class UltrasoundFiles(Section):
     """Tracked sweeps, and the first guess of where the tracker stands."""
 
     sweeps: tuple[Path, ...] = Field(min_length=1)
@@ -78,7 +74,7 @@ class UltrasoundFiles(_Section):
     """Name of the marker or device in whose frame poses are taken, such as Reference."""
 
 
-class Described(_Section):
+class Described(Section):
     """What ``study.yaml`` may say."""
 
     patient_id: str = Field(pattern=f"^{PATIENT_ID}$")

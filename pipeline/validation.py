@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from typing import Any, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 PLAIN = {
     **dict.fromkeys(("tuple_type", "list_type"), "needs a list, such as [first, second]"),
@@ -14,6 +14,23 @@ PLAIN = {
     **dict.fromkeys(("bool_parsing", "bool_type"), "needs true or false"),
 }
 """What the library's kinds of error ask for, in words."""
+
+
+class Section(BaseModel):
+    """Keys that a user writes: none unknown, and no number infinite or written as ``true``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_no_truth(cls, given: Any) -> Any:
+        """The library takes true for the number 1, which nobody means by it."""
+        for name, field in cls.model_fields.items() if isinstance(given, dict) else ():
+            value = given.get(field.alias or name)
+            kinds = {field.annotation, *get_args(field.annotation)}
+            if isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
+                raise ValueError(f"{name} is {str(value).lower()}; needs a number")
+        return given
 
 
 def describe_validation(

@@ -378,6 +378,8 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("us: {sweeps: us/a.mha}", r"us\.sweeps: needs a list, such as"),
         ("us: {initial_mr_from_tracker: [[1, 0, 0]]}", r"tracker\.0: needs 4 entries, not 3"),
         ("cine: {rr_ms: fast}", r"cine\.rr_ms: needs a number \(got 'fast'\)"),
+        ("cine: {rr_ms: true}", "cine: rr_ms is true; needs a number"),
+        ("cine: {rr_ms: .inf}", r"cine\.rr_ms: Input should be a finite number"),
         ("cine: {fill_gaps: maybe}", "needs true or false"),
         ("cine: {path: cine, rr_ms: -3}", "cine.rr_ms"),
         ("patient_id: ../../etc", "patient_id"),

@@ -12,13 +12,13 @@ from types import MappingProxyType
 from typing import Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     field_serializer,
     field_validator,
     model_validator,
 )
+
+from pipeline.validation import Section
 
 Kind = Literal["guidance", "forbidden_region"]
 Side = Literal["inside", "outside"]
@@ -48,12 +48,6 @@ def delta_from_gamma(gamma_mm: float, level: float, m: int) -> float:
     6.7
     """
     return gamma_mm / (math.sqrt(2) * math.pow(-math.log1p(-level), 1 / (2 * m)))
-
-
-class Section(BaseModel):
-    """Settings that refuse unknown keys and changes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Device(Section):

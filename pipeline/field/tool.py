@@ -19,7 +19,6 @@ import numpy.typing as npt
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.errors import InputError
-from pipeline.field.fixture import Section
 from pipeline.geometry import (
     Float,
     Grid,
@@ -28,6 +27,7 @@ from pipeline.geometry import (
     transform_points,
 )
 from pipeline.meshes import require_whole
+from pipeline.validation import Section
 
 Point = tuple[float, float, float]
 

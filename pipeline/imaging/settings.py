@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from pipeline.validation import Section
 
 LOW_CONFIDENCE = 0.8
 """Labels of an image that are trusted less are shown as doubtful."""
 
 
-class SegmentSettings(BaseModel):
+class SegmentSettings(Section):
     """How the heart is labelled in the images and carried to an isotropic grid."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     most_views: int = Field(5, ge=1, le=5)
     """In how many ways, each turned a little otherwise, the network is shown each image; the more

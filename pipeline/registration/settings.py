@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from pipeline.validation import Section
 
 
-class RegisterSettings(BaseModel):
+class RegisterSettings(Section):
     """How tracked ultrasound is brought to the MR model."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     min_frames: int = Field(10, ge=3)
     """Fewer frames than this are refused: they do not fix six degrees of freedom."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from pipeline.validation import Section
 
 
-class SurfaceSettings(BaseModel):
+class SurfaceSettings(Section):
     """How labels become surfaces that move."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     edge_mm: float = Field(2.0, gt=0.5, le=10)
     """Mean edge of the triangles."""
