@@ -27,7 +27,7 @@ from pipeline.geometry import Float
 from pipeline.imaging.nifti import write_image
 from pipeline.products import read_cine
 
-PHASES = 5
+PHASES = 4
 
 STUDY_CONFIG = f"mr: {{phases: {PHASES}}}\nultrasound: {{frames: 25}}\n"
 RUN_CONFIG = "segment: {most_views: 2}\nbake: {spacing_mm: 2.5}\n"
@@ -175,7 +175,7 @@ def test_a_server_reads_the_field_with_json_and_memory_maps_alone(products: Path
     array = json.loads((store / "distance" / fixture["structure"] / "zarr.json").read_text())
     shape = tuple(array["shape"])
     assert len(described["phases"]) == shape[0] == PHASES
-    phase = 3
+    phase = PHASES - 2
     chunk = store / "distance" / fixture["structure"] / "c" / str(phase) / "0" / "0" / "0"
     stored = np.memmap(chunk, dtype="<f4", mode="r", shape=shape[1:])
     rng = np.random.default_rng(0)
