@@ -80,6 +80,19 @@ def test_images_of_neither_time_nor_number_are_refused(tmp_path: Path, number: i
         read_dicom_cine(tmp_path, RR_MS)
 
 
+@pytest.mark.parametrize("rr_ms", [None, RR_MS])
+def test_one_image_without_a_time_is_named(tmp_path: Path, rr_ms: float | None) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "short axis")
+        if (number, phase) == (1, 2):
+            del data.TriggerTime
+        return True
+
+    write_dicom(tmp_path, change)
+    with pytest.raises(InputError, match=r"no trigger time, as 1 of the stack's \d+ images.*again"):
+        read_dicom_cine(tmp_path, rr_ms)
+
+
 @pytest.mark.parametrize("how", ["twice", "uid a file", "uid a phase"])
 def test_copies_and_uids_do_not_hinder_the_order(tmp_path: Path, how: str) -> None:
     def change(data: FileDataset, number: int, phase: int) -> bool:

@@ -164,6 +164,19 @@ def test_an_offset_that_is_ignored_is_not_looked_at(recording, surfaces):
     assert settle_clock(search, best, recording.sweeps, None, "apply").clock is None
 
 
+def test_r_times_in_doubt_give_no_offset(recording, surfaces):
+    """A record told at half its sampling rate: beats twice as long as the cine's, by which the
+    phases are wrong whatever the offset, though some offset fits best."""
+    timing = replace(stamped(recording, 0.1), cycle_rr_s=RR_S / 2)
+    search, best, found = settled(recording, surfaces, timing, "apply")
+    assert len(timing.doubts()) == 1
+    assert found.clock.offset_s is None
+    assert found.clock.applied_s == 0.0
+    assert found.search is search
+    assert found.best is best
+    assert replace(timing, cycle_rr_s=RR_S).doubts() == []
+
+
 @pytest.fixture(scope="module")
 def truly(recording, surfaces):
     """What is found at the true phases."""

@@ -221,12 +221,19 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
 
 
 def _require_timing(frames: Sequence[Frame]) -> None:
+    untimed = [frame for frame in frames if not frame.times_ms]
+    if untimed and len(untimed) < len(frames):
+        raise InputError(
+            f"{untimed[0].where}: has no trigger time, as {len(untimed)} of the stack's "
+            f"{len(frames)} images; the others have: export these again with TriggerTime "
+            "(0018,1060)"
+        )
+    if untimed:
+        raise InputError(
+            f"{untimed[0].where}: has no trigger time; export the cine with TriggerTime "
+            f"(0018,1060), or {EVENLY}"
+        )
     for frame in frames:
-        if not frame.times_ms:
-            raise InputError(
-                f"{frame.where}: has no trigger time; export the cine with TriggerTime "
-                f"(0018,1060), or {EVENLY}"
-            )
         _rr_ms(frame)
 
 

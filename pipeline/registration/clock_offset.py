@@ -20,7 +20,7 @@ from pipeline.geometry import Float, Integer
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import Best, Level, Search
-from pipeline.registration.time import median_rr_s, phases_at
+from pipeline.registration.time import doubts_of_rate, median_rr_s, phases_at
 from pipeline.registration.uncertainty import REACH, long_run
 
 Choice = Literal["apply", "measure", "ignore"]
@@ -83,6 +83,12 @@ class Timing:
         times_s = np.concatenate(self.times_s)[number] - offset_s
         return phases_at(np.clip(times_s, first, last), self.r_times_s, self.cycle_rr_s)
 
+    def doubts(self) -> list[str]:
+        """What speaks against the R times being those of the heart in the cine, in sentences."""
+        if self.cycle_rr_s is None:
+            return []
+        return doubts_of_rate(self.r_times_s, self.cycle_rr_s)
+
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
@@ -90,7 +96,7 @@ class ClockOffset:
 
     offset_s: float | None
     """Time stamp less time on the ECG's clock, within half a beat; None where the frames do not
-    tell: too few of them, two offsets that fit alike, or an unsure one."""
+    tell: too few of them, two offsets that fit alike, an unsure one, or R times in doubt."""
 
     sd_s: float
     """Its standard deviation; infinite where there is no summit."""
@@ -141,6 +147,10 @@ def settle_clock(
     """
     if timing is None or choice == "ignore":
         return Settled(search, best, None)
+    unknown = ClockOffset(None, np.inf, best.pose)
+    if timing.doubts():
+        # By beats of another length some offset always fits best, and it means nothing.
+        return Settled(search, best, unknown)
     level = search.fine_level(sweeps).thinned(search.settings.max_frames)
     clock = estimate_offset(level, best.pose, search.pivot, timing)
     if clock.offset_s is None or not clock.significant:
@@ -157,7 +167,7 @@ def settle_clock(
                 return Settled(search, best, clock)
             there = replace(search, phases=timing.phases(clock.offset_s))
             return Settled(there, found, replace(clock, applied_s=clock.offset_s))
-    return Settled(search, best, ClockOffset(None, np.inf, best.pose))
+    return Settled(search, best, unknown)
 
 
 def estimate_offset(

@@ -23,7 +23,7 @@ from pipeline.products import (
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import Registration, register, require_frames
-from pipeline.registration.time import detect_r_peaks, doubts_of_rate, median_rr_s, phases_at
+from pipeline.registration.time import detect_r_peaks, median_rr_s, phases_at
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on how a study's folder is understood.
@@ -98,7 +98,7 @@ def _registered(
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
     cine = read_cine(job.products / "ingest")
-    doubts = [*_doubts_of_images(job), *_doubts_of_rate(timing)]
+    doubts = [*_doubts_of_images(job), *timing.doubts()]
     known = start, settings, job.progress, timing, cine, doubts
     try:
         return register(sweeps, phases, surfaces, *known)
@@ -141,12 +141,6 @@ def _doubts_of_images(job: Job) -> list[str]:
         "the MR's images are a mirror image of what their header says, to which no tracker's pose "
         "fits: look at the order of the slices and the orientation in the file"
     ]
-
-
-def _doubts_of_rate(timing: Timing) -> list[str]:
-    if timing.cycle_rr_s is None:
-        return []
-    return doubts_of_rate(timing.r_times_s, timing.cycle_rr_s)
 
 
 def _r_times_s(study: Study, ecg: Ecg) -> Float:
