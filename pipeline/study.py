@@ -18,20 +18,19 @@ from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
 from pipeline.publish import sha256_of
 from pipeline.regular_files import require_no_device
-from pipeline.study_files import files_below, names_in_header, record_files, sweep_files
+from pipeline.study_files import files_below, record_files, require_signals, sweep_files
+from pipeline.study_folders import (
+    NIFTI_ENDINGS,
+    found_cine,
+    found_ecg,
+    found_us,
+    require_names_of_folders,
+    require_no_other_sweep,
+)
 from pipeline.validation import Section, describe_validation
 from pipeline.yaml_files import read_yaml
 
-NIFTI_ENDINGS = (".nii", ".nii.gz")
-DICOM_ENDINGS = (".dcm", ".ima", "")
-SWEEP_ENDINGS = (".mha", ".mhd")
-UNREAD_SWEEP_ENDINGS = (".nrrd", ".nhdr", ".mkv", ".webm")
-"""What PLUS and 3D Slicer write as well."""
-
 PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
-
-MEANT = {"us": ("ultrasound", "sweeps"), "ecg": ("ekg", "ecgs")}
-"""Names that a user may give a folder, by the one that is read."""
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -208,14 +207,14 @@ def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
             "letter or digit first; rename the folder, or give patient_id in study.yaml"
         )
     content = {"patient_id": folder.name, **given}
-    for name, found in (("ecg", _found_ecg(folder)), ("us", _found_us(folder))):
+    for name, found in (("ecg", found_ecg(folder)), ("us", found_us(folder))):
         content[name] = _overridden(found, given[name]) if name in given else found
     if content["ecg"] is None:
         content["ecg"] = {}
     if "us" not in given:
-        _require_no_other_sweep(folder / "us", content["us"])
-    _require_names_of_folders(folder, given)
-    content["cine"] = _found_cine(folder, given.get("cine", {}))
+        require_no_other_sweep(folder / "us", content["us"])
+    require_names_of_folders(folder, given)
+    content["cine"] = found_cine(folder, given.get("cine", {}))
     try:
         described = Described.model_validate(content)
     except ValidationError as error:
@@ -249,111 +248,6 @@ def _absolute(study: Study) -> Study:
     return study.model_copy(update=update)
 
 
-def _found_cine(folder: Path, given: Any) -> Any:
-    """The cine's section: a folder that holds a NIfTI file stands for it, with its timing."""
-    path = given.get("path", "cine") if isinstance(given, dict) else None
-    if not isinstance(path, str):
-        return given
-    cine = folder / path
-    images = [one for one in files_below(cine) if one.name.lower().endswith(NIFTI_ENDINGS)]
-    if len(images) > 1:
-        raise InputError(
-            f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}), one 4D "
-            "file is needed: name it under cine.path in study.yaml, or, where each file is one "
-            "phase, join them into one and write timing.json beside it, as docs/study.md shows"
-        )
-    if images and cine.is_dir():
-        _require_no_dicom(cine, images[0])
-    if not images and (cine / "timing.json").exists():
-        raise InputError(
-            f"{cine}: holds timing.json, but no NIfTI file (.nii, .nii.gz) that it would be of; "
-            "put that beside it, or, of DICOM files, take timing.json out"
-        )
-    timing = images[0].with_name("timing.json") if images else None
-    if timing and "timing" not in given:
-        _require_name_of_timing(timing, folder)
-    found = {"timing": timing if timing and timing.exists() else None}
-    return {**found, **given, "path": images[0] if images else cine}
-
-
-def _require_name_of_timing(timing: Path, folder: Path) -> None:
-    """Refuse a file that a user took for the cine's timing, and that nothing would read."""
-    for one in [*timing.parent.glob("*.json"), *folder.glob("*.json")]:
-        if "timing" in one.name.lower() and one != timing:
-            raise InputError(
-                f"{one}: would not be read; name it {timing}, or under cine.timing in study.yaml"
-            )
-
-
-def _require_no_dicom(cine: Path, image: Path) -> None:
-    """Refuse a folder in which one NIfTI file would stand for what may be another cine."""
-    for one in files_below(cine):
-        if one.suffix.lower() in DICOM_ENDINGS:
-            raise InputError(
-                f"{cine}: holds {image.name}, a NIfTI file, and {one.name}, as of DICOM; keep "
-                "one sort there, or name the NIfTI file under cine.path in study.yaml"
-            )
-
-
-def _found_ecg(folder: Path, inside: str = "ecg") -> dict[str, Any]:
-    return {name: _record(folder / inside / name) for name in ("mr", "us")}
-
-
-def _found_us(folder: Path, inside: str = "us") -> dict[str, Any] | None:
-    beside = (one for one in files_below(folder / inside) if one.parent == folder / inside)
-    sweeps = tuple(one for one in beside if one.suffix.lower() in SWEEP_ENDINGS)
-    return {"sweeps": sweeps} if sweeps else None
-
-
-def _require_names_of_folders(folder: Path, given: dict[str, Any]) -> None:
-    """Refuse files that would be read but for their folder's name, which is nearly right."""
-
-    def holds(name: str, inside: str) -> bool:
-        found = _found_us(folder, inside) if name == "us" else _found_ecg(folder, inside)
-        return any((found or {}).values())
-
-    for path in sorted(one for one in folder.iterdir() if one.is_dir()):
-        for name, others in MEANT.items():
-            near = path.name != name and path.name.lower() in (name, *others)
-            # Where capitals do not matter, US is us itself.
-            if near and name not in given and holds(name, path.name) and not holds(name, name):
-                raise InputError(
-                    f"{path}: would not be read; rename it to {name}/, or name its files under "
-                    f"{name} in study.yaml (`{name}: null` for none)"
-                )
-
-
-def _require_signals(header: Path) -> None:
-    """Refuse a WFDB header whose signals, or whose segments and theirs, are not beside it."""
-    for name in names_in_header(header):
-        segment = header.parent / f"{name}.hea"
-        if segment != header and segment.is_file():
-            _require_signals(segment)
-        elif not (header.parent / name).is_file():
-            raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
-
-
-def _require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
-    """Refuse files that a user took for sweeps, and that nothing would read."""
-    taken = found["sweeps"] if found else ()
-    for one in files_below(us):
-        recorded = one.suffix.lower() in (*SWEEP_ENDINGS, *UNREAD_SWEEP_ENDINGS)
-        if found is None or (recorded and one not in taken):
-            raise InputError(
-                f"{us}: {one.relative_to(us)} would not be read; sweeps are .mha or .mhd files "
-                "directly in this folder: convert, move or remove it, name all sweeps under "
-                "us.sweeps in study.yaml, or write `us: null` there"
-            )
-
-
-def _record(stem: Path) -> Path | None:
-    if stem.with_suffix(".hea").exists():
-        return stem
-    return next(
-        (stem.with_suffix(end) for end in (".csv", ".dcm") if stem.with_suffix(end).exists()), None
-    )
-
-
 def _require_files(study: Study) -> None:
     if study.cine.path == study.folder / "cine" and not study.cine.path.exists():
         raise InputError(
@@ -376,7 +270,7 @@ def _require_files(study: Study) -> None:
             raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
         for header in record_files(stem):
             if stem and header.suffix == ".hea" and header.stem == stem.stem:
-                _require_signals(header)
+                require_signals(header)
     if study.us and study.ecg.us is None:
         beside = sorted(one.relative_to(study.folder).as_posix() for one in
                         files_below(study.folder / "ecg"))  # fmt: skip

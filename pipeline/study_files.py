@@ -162,3 +162,19 @@ def sweep_files(sweep: Path) -> list[Path]:
         return [sweep, sweep.parent / name]
     others = (one for one in _in_folder(sweep.parent) if one.suffix.lower() not in (".mha", ".mhd"))
     return [sweep, *(one for one in others if _is_file(one))]
+
+
+def require_signals(header: Path) -> None:
+    """Refuse a WFDB header whose signals, or whose segments and theirs, are not beside it.
+
+    Raises
+    ------
+    InputError
+        Naming the first that is not there.
+    """
+    for name in names_in_header(header):
+        segment = header.parent / f"{name}.hea"
+        if segment != header and segment.is_file():
+            require_signals(segment)
+        elif not (header.parent / name).is_file():
+            raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
