@@ -29,6 +29,7 @@ from pipeline.geometry import MovingSurface
 from pipeline.job import Skipped
 from pipeline.products import FrameRow, read_frames, write_frames
 from pipeline.registration import space
+from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
 from pipeline.registration.uncertainty import motion_between
@@ -60,10 +61,9 @@ def a_job(settings, mirror_image=False):
 
 
 def timing_of(recording, cycle_rr_s):
-    """Of a heart that beats every 0.8 s."""
-    return SimpleNamespace(
-        phases=lambda: recording.phases, r_times_s=0.8 * np.arange(9), cycle_rr_s=cycle_rr_s
-    )
+    """Of frames in the second beat of a heart that beats every 0.8 s."""
+    times_s = [0.8 * (1 + phases) for phases in recording.phases]
+    return Timing(times_s, 0.8 * np.arange(9), cycle_rr_s)
 
 
 class TestRegister:
