@@ -15,7 +15,7 @@ from pipeline.registration import compiled as clock
     ("door", "marks"),
     [
         (phantom, ("compiled",)),
-        (clock, ("compiled",)),
+        (clock, ("asked", "inner")),
         (field, ("asked", "inner")),
         (dissection, ("asked", "inner")),
     ],

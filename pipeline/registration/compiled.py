@@ -15,10 +15,19 @@ _DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules"
 _SOURCES = (*_DETECTOR, "ticks")
 
 
-def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Compile a numeric function to machine code; the result is kept on disk between runs."""
-    # Only what Python calls needs a way in from there, which would be compiled too.
-    inner = function.__name__.startswith("_")
-    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": inner}
-    made = door(Path(__file__).parent, _SOURCES, **options)
+def asked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile what Python calls; the result is kept on disk between runs."""
+    return _compile(function, no_cpython_wrapper=False)
+
+
+def inner(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile what only compiled code calls: a way in from Python would be compiled too."""
+    return _compile(function, no_cpython_wrapper=True)
+
+
+def _compile(
+    function: Callable[Parameters, Result], no_cpython_wrapper: bool
+) -> Callable[Parameters, Result]:
+    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True}
+    made = door(Path(__file__).parent, _SOURCES, **options, no_cpython_wrapper=no_cpython_wrapper)
     return cast("Callable[Parameters, Result]", made(function))

@@ -153,6 +153,10 @@ class Now:
     steep: float
     sharp: float
     """How much of its steepest change half the time takes: 0.5 where it is smooth, 1 for a step."""
+    overdue: bool
+    """Whether waves are judged again because a beat is overdue."""
+    anew: bool
+    """Whether the wave judged last shows that the beats before it were none."""
     after: bool
     """Whether the wave measured last may be the T wave of the last beat."""
     towers: int

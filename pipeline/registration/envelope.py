@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import inner
 from pipeline.registration.detector_state import Plan, State
 from pipeline.registration.quality import BRIDGED_S, SETTLE_S, watch
 
 
-@compiled
+@inner
 def store(sample: Float, plan: Plan, s: State) -> None:
     """Put one sample of every lead into the rings, and filter."""
     now, length = s.now[0].seen, plan.length
@@ -38,7 +38,7 @@ def store(sample: Float, plan: Plan, s: State) -> None:
         _filter(k, now, plan, s)
 
 
-@compiled
+@inner
 def _bridge(k: int, value: float, now: int, plan: Plan, s: State) -> None:
     """A lead is back: let a line lead to it from its last sample, if it was away for a moment."""
     lead, count, length = s.leads[k], s.leads[k].missing, plan.length
@@ -56,7 +56,7 @@ def _bridge(k: int, value: float, now: int, plan: Plan, s: State) -> None:
     lead.last, lead.run = value, 0
 
 
-@compiled
+@inner
 def _filter(k: int, now: int, plan: Plan, s: State) -> None:
     """Power of the wavelet half its width ago, and its mean half a mean before that."""
     half, length = plan.half, plan.length

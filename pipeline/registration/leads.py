@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import inner
 from pipeline.registration.detector_state import Plan, State
 from pipeline.registration.quality import RUN_S, shows_nothing
 from pipeline.registration.rules import T_WAVE_S
@@ -18,7 +18,7 @@ SHOWN, SILENT, AWAY_S, SILENT_EVERY_S = 0.6, 0.1, 3.0, 0.1
 beats' energy, while another had the first, is lost for so long. It is looked for so often."""
 
 
-@compiled
+@inner
 def fuse(i: int, plan: Plan, s: State) -> float:
     """Weigh all leads by what they show now: their energy at sample ``i``, 1 for a usual beat."""
     total, weights, now = 0.0, 0.0, s.now[0].seen
@@ -38,7 +38,7 @@ def fuse(i: int, plan: Plan, s: State) -> float:
     return total / weights if weights > 0.0 else 0.0
 
 
-@compiled
+@inner
 def refuse_knocks(at: int, plan: Plan, s: State) -> None:
     """Take the say from leads whose energy near a wave is beyond any beat's: they were knocked."""
     for k in range(len(s.leads)):
@@ -50,7 +50,7 @@ def refuse_knocks(at: int, plan: Plan, s: State) -> None:
             usual.level *= GAIN
 
 
-@compiled
+@inner
 def refuse_silent(i: int, plan: Plan, s: State) -> None:
     """A beat is overdue: take the say from leads that show nothing where others show beats.
 
@@ -69,7 +69,7 @@ def refuse_silent(i: int, plan: Plan, s: State) -> None:
             lead.bad_until = max(lead.bad_until, s.now[0].seen + AWAY_S * plan.rate_hz)
 
 
-@compiled
+@inner
 def _most_since(k: int, first: int, last: int, plan: Plan, s: State) -> float:
     """The largest energy of a lead in a stretch of samples, 1 for a usual beat; 0 if it is off."""
     lead, most = s.leads[k], 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import inner
 from pipeline.registration.detector_state import KEPT_WAVES, Lead, Plan, State
 
 REFRACTORY_S = 0.20
@@ -18,7 +18,7 @@ LEAST_NOISE = 0.02
 """
 
 
-@compiled
+@inner
 def wave_levels(
     k: int, first: int, last: int, plan: Plan, s: State
 ) -> tuple[float, float, bool, bool]:
@@ -50,7 +50,7 @@ def wave_levels(
     return level, seen[int(0.7 * len(seen))], lone, even
 
 
-@compiled
+@inner
 def follow_noise(lead: Lead, energy: float, rate_hz: float) -> None:
     """Track the energy that 7 samples in 10 stay under: QRS complexes take less than 3."""
     step = 4.0 / rate_hz
@@ -58,7 +58,7 @@ def follow_noise(lead: Lead, energy: float, rate_hz: float) -> None:
     lead.noise = max(lead.noise, LEAST_NOISE * lead.usual.level)
 
 
-@compiled
+@inner
 def learn_level(lead: Lead, energy: float, late: bool) -> None:
     """Move the level of a lead's beats a little towards this one, in the logarithm."""
     usual = lead.usual

@@ -19,7 +19,7 @@ With every sample, in this order:
    takes it for a beat if it is none of noise, T waves and P waves (``rules``). It may also show
    that the beat before was its P wave, or in a fast heart a T wave: that one is unlearnt.
 6. ``_look_back``: when a beat is overdue, the highest wave since the last one is judged again, by
-   lower thresholds; after a long silence levels are learnt again.
+   lower thresholds; after a long silence levels are learnt again (``_learn_again``).
 7. ``_accept``: a beat, timed by its shape (``waves``), is told; levels, intervals and shapes
    follow it.
 """
@@ -27,7 +27,7 @@ With every sample, in this order:
 from __future__ import annotations
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import asked, inner
 from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
 from pipeline.registration.envelope import store
 from pipeline.registration.leads import SILENT_EVERY_S, fuse, refuse_knocks, refuse_silent
@@ -87,7 +87,7 @@ MOST_BETWEEN = 0.6
 """Height that a wave between beats counts with at most."""
 
 
-@compiled
+@asked
 def feed(block: Float, plan: Plan, s: State) -> int:
     """Take ``(n, leads)`` samples; how many beats became known: the first of ``s.found``."""
     now = s.now[0]
@@ -99,16 +99,18 @@ def feed(block: Float, plan: Plan, s: State) -> int:
         middle = at - plan.half - plan.mean
         if middle < 0:
             continue
-        if now.learnt:
-            _decide(middle, plan, s)
-        elif at - now.learn_at >= plan.learn:
-            _learn(middle, plan, s)
+        first = middle
+        if not now.learnt:
+            first = _learn(middle, plan, s) if at - now.learn_at >= plan.learn else middle + 1
+        for i in range(first, middle + 1):
+            _decide(i, plan, s)
     return now.found
 
 
-@compiled
-def _learn(middle: int, plan: Plan, s: State) -> None:
-    """First levels, from all that has been seen; then decide about all of that."""
+@inner
+def _learn(middle: int, plan: Plan, s: State) -> int:
+    """First levels, from all that has been seen; the sample from which on they decide, which is
+    yet to come where no beat is plain to see."""
     now = s.now[0]
     first = max(0, middle - plan.length + 4 * plan.half)
     clear, highest = False, 0.0
@@ -120,21 +122,21 @@ def _learn(middle: int, plan: Plan, s: State) -> None:
     # A slow heart may not have beaten yet.
     now.learn_at = now.seen + int(LOOK_S * plan.rate_hz) - plan.learn
     if not clear and (middle - first < MOST_S * plan.rate_hz or highest <= 0.0):
-        return
+        return middle + 1
     now.learnt = True
     learn_stature(first, middle, plan, s)
     # A record may begin with a beat; none is overdue yet.
     s.now[0].rhythm.last_at = first - int(T_WAVE_S * plan.rate_hz)
-    for i in range(first, middle + 1):
-        _decide(i, plan, s)
+    return first
 
 
-@compiled
+@inner
 def _decide(i: int, plan: Plan, s: State) -> None:
     """Look at the energy at sample ``i``: has a wave passed, is a beat overdue?"""
-    now = s.now[0]
+    now, rhythm, rate_hz = s.now[0], s.now[0].rhythm, plan.rate_hz
+    beat, silent = -1, False
     for k in range(len(s.leads)):
-        follow_noise(s.leads[k], s.energy[k, i % plan.length], plan.rate_hz)
+        follow_noise(s.leads[k], s.energy[k, i % plan.length], rate_hz)
     height = fuse(i, plan, s)
     s.fused[i % plan.length] = height
     if height > now.best:
@@ -143,21 +145,30 @@ def _decide(i: int, plan: Plan, s: State) -> None:
         at = now.best_at
         now.best, now.best_at = -1.0, i
         # Else it only falls from a wave that was judged.
-        if s.fused[at % plan.length] > s.fused[(at - 1) % plan.length]:
-            _judge(at, plan, s)
-    if i - s.now[0].rhythm.last_at > OVERDUE * s.now[0].rhythm.usual_rr:
-        _look_back(i, plan, s)
+        if s.fused[at % plan.length] > s.fused[(at - 1) % plan.length] and _judge(at, plan, s):
+            beat = at
+    if beat < 0 and i - rhythm.last_at > OVERDUE * rhythm.usual_rr:
+        beat = _look_back(i, plan, s)
+        silent = beat < 0 and _is_silent(i, plan, s)
+    unclear = beat >= 0 and _accept(beat, plan, s)
+    if unclear or silent:
+        first, last = beat - int(RECENT_S * rate_hz), beat
+        if silent:
+            first = rhythm.last_at + int(LATE_T_WAVE_S * rate_hz)
+            last = i - int(PATIENCE_S * rate_hz)
+        _learn_again(first, last, i - rhythm.last_at > MOST_S * rate_hz, plan, s)
 
 
-@compiled
-def _judge(at: int, plan: Plan, s: State) -> None:
-    """Take the wave at a sample for a beat or not."""
-    rhythm = s.now[0].rhythm
+@inner
+def _judge(at: int, plan: Plan, s: State) -> bool:
+    """Whether the wave at a sample is a beat."""
+    now, rhythm = s.now[0], s.now[0].rhythm
+    now.overdue = False
     since_s = (at - rhythm.last_at) / plan.rate_hz
     measure_stature(at, plan, s)
     doubted = since_s < LONG_AHEAD_S and last_may_be_p_wave(at, s)
     if since_s < SPLIT_S and not doubted:
-        return
+        return False
     # Leads that turned out to be lost since then no longer count.
     refuse_knocks(at, plan, s)
     height = fuse(at, plan, s)
@@ -169,21 +180,23 @@ def _judge(at: int, plan: Plan, s: State) -> None:
         anew = rhythm.outdone_before >= OUTDONE
     instead = instead or anew
     if instead:
-        since_s = (at - s.now[0].before.last_at) / plan.rate_hz
-    s.now[0].after = False
+        since_s = (at - now.before.last_at) / plan.rate_hz
+    now.after = False
     usual_t_wave = not instead and is_usual_t_wave(since_s, height, plan, s)
     if since_s < REFRACTORY_S or usual_t_wave:
-        return
-    if is_beat(since_s, height, False, plan, s) and resembles(at, since_s, height, False, plan, s):
-        if instead:
-            _take_back(s)
-            measure_beat(at, s.found[s.now[0].found], plan, s)
-        _accept(at, height, False, instead, anew, plan, s)
-    else:
+        return False
+    if not is_beat(since_s, height, plan, s) or not resembles(at, since_s, height, plan, s):
         _keep(at, height, s)
+        return False
+    wave = s.found[now.found]
+    if instead:
+        _take_back(s)
+        measure_beat(at, wave, plan, s)
+    wave.height, wave.instead, now.anew = height, instead, anew
+    return True
 
 
-@compiled
+@inner
 def _take_back(s: State) -> None:
     """The last beat was none: know what was known before it, and that such a wave is no beat."""
     now, low = s.now[0], min(s.now[0].rhythm.last_height, MOST_BETWEEN)
@@ -193,7 +206,7 @@ def _take_back(s: State) -> None:
         lead.usual = lead.before
 
 
-@compiled
+@inner
 def _keep(at: int, height: float, s: State) -> None:
     """A wave that was no beat: learn from it, and keep it for when one is overdue."""
     now = s.now[0]
@@ -203,32 +216,38 @@ def _keep(at: int, height: float, s: State) -> None:
     now.waiting += 1
 
 
-@compiled
-def _look_back(i: int, plan: Plan, s: State) -> None:
-    """A beat is overdue: take the highest wave since the last one, or lower the levels."""
+@inner
+def _look_back(i: int, plan: Plan, s: State) -> int:
+    """A beat is overdue: the sample of the highest wave since the last one, if that may be it; -1
+    if not."""
     now, rhythm, rate_hz = s.now[0], s.now[0].rhythm, plan.rate_hz
+    now.overdue = True
     # Before some beats are known, one lead may have the levels of another's noise.
     if rhythm.beats > KEPT_INTERVALS and i % max(1, int(SILENT_EVERY_S * rate_hz)) == 0:
         refuse_silent(i, plan, s)
     best = _highest_kept(i, plan, s)
-    if best >= 0:
-        wave = s.waves[best]
-        # Of a wave that is kept only the sum over all leads is known.
-        measure_stature(wave.at, plan, s)
-        now.after = False
-        since_s = (wave.at - rhythm.last_at) / rate_hz
-        if resembles(wave.at, since_s, wave.height, True, plan, s):
-            _accept(wave.at, wave.height, True, False, False, plan, s)
-            return
-        wave.height = 0.0
-    silent_s = (i - max(rhythm.last_at, now.learn_at)) / rate_hz
-    if silent_s > max(SILENCE_S, SILENCE * rhythm.usual_rr / rate_hz):
-        first = rhythm.last_at + int(LATE_T_WAVE_S * rate_hz)
-        racing = i - rhythm.last_at > MOST_S * rate_hz
-        _learn_again(first, i - int(PATIENCE_S * rate_hz), racing, plan, s)
+    if best < 0:
+        return -1
+    kept, wave = s.waves[best], s.found[now.found]
+    # Of a wave that is kept only the sum over all leads is known.
+    measure_stature(kept.at, plan, s)
+    now.after = False
+    if not resembles(kept.at, (kept.at - rhythm.last_at) / rate_hz, kept.height, plan, s):
+        kept.height = 0.0
+        return -1
+    wave.height, wave.instead, now.anew = kept.height, False, False
+    return kept.at
 
 
-@compiled
+@inner
+def _is_silent(i: int, plan: Plan, s: State) -> bool:
+    """Whether no beat was found for so long that levels must be wrong."""
+    rhythm = s.now[0].rhythm
+    silent_s = (i - max(rhythm.last_at, s.now[0].learn_at)) / plan.rate_hz
+    return silent_s > max(SILENCE_S, SILENCE * rhythm.usual_rr / plan.rate_hz)
+
+
+@inner
 def _highest_kept(i: int, plan: Plan, s: State) -> int:
     """The highest wave since the last beat that is high enough for one; -1 if there is none."""
     now, best = s.now[0], -1
@@ -239,14 +258,14 @@ def _highest_kept(i: int, plan: Plan, s: State) -> int:
         if (
             since_s >= REFRACTORY_S
             and i - wave.at >= PATIENCE_S * plan.rate_hz
-            and is_beat(since_s, wave.height, True, plan, s)
+            and is_beat(since_s, wave.height, plan, s)
             and (best < 0 or wave.height > s.waves[best].height)
         ):
             best = k
     return best
 
 
-@compiled
+@inner
 def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> None:
     """Beats may have become smaller, or what was taken for beats was none: new levels.
 
@@ -277,14 +296,13 @@ def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> N
             usual.level, lead.noise = level, noise
 
 
-@compiled
-def _accept(
-    at: int, height: float, late: bool, instead: bool, anew: bool, plan: Plan, s: State
-) -> None:
-    """A beat that was measured: learn from it, all ``anew`` if those before were none, and report
-    it."""
+@inner
+def _accept(at: int, plan: Plan, s: State) -> bool:
+    """The wave that was judged last is a beat: learn from it, and report it; whether beats have
+    become unclear."""
     now, rhythm, wave = s.now[0], s.now[0].rhythm, s.found[s.now[0].found]
-    anew = towers(height, s) or anew
+    height, late = wave.height, now.overdue
+    anew = towers(height, s) or now.anew
     if not now.after:
         learn_t_wave(s)
     now.before = now.rhythm
@@ -307,15 +325,14 @@ def _accept(
         learn_level(lead, energy, late)
         if lead.weight > 0.0:
             contrast = max(contrast, usual.level / lead.noise)
-    wave.known_at, wave.height, wave.late, wave.instead = now.seen - 1, height, late, instead
+    wave.known_at, wave.late = now.seen - 1, late
     wave.breadth = now.tall / now.steep if now.steep > 0.0 else 1.0
     learn_beat(at, wave, anew, plan, s)
     now.found += 1
-    if contrast < UNCLEAR and at - now.learn_at > RECENT_S * plan.rate_hz:
-        _learn_again(at - int(RECENT_S * plan.rate_hz), at, False, plan, s)
+    return contrast < UNCLEAR and at - now.learn_at > RECENT_S * plan.rate_hz
 
 
-@compiled
+@inner
 def _drop_waves(at: int, s: State) -> None:
     """Of the waves that are kept only those after the last beat may still be beats."""
     now, kept = s.now[0], 0
@@ -326,7 +343,7 @@ def _drop_waves(at: int, s: State) -> None:
     now.waiting = kept
 
 
-@compiled
+@inner
 def _learn_interval(at: int, plan: Plan, s: State) -> None:
     rhythm = s.now[0].rhythm
     interval = float(at - rhythm.last_at)

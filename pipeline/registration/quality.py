@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import inner
 from pipeline.registration.detector_state import Lead, Plan
 
 RUN_S = 0.12
@@ -48,7 +48,7 @@ HESITATE_S = 0.5
 """So long such a time waits, at most, for the swing to stop falling."""
 
 
-@compiled
+@inner
 def watch(lead: Lead, ring: Float, value: float, now: int, plan: Plan) -> None:
     """Take a lead's next sample, before it is stored: is the lead off?
 
@@ -68,7 +68,7 @@ def watch(lead: Lead, ring: Float, value: float, now: int, plan: Plan) -> None:
         _watch_swing(lead, _swing(ring, now, plan), now, rate_hz)
 
 
-@compiled
+@inner
 def _watch_runs(lead: Lead, step: float, now: int, rate_hz: float) -> None:
     """Follow runs of one value. A run that begins or ends with a jump is a lead that came off."""
     jumped = step > JUMP_SHARE * lead.usual.size_mv
@@ -81,7 +81,7 @@ def _watch_runs(lead: Lead, step: float, now: int, rate_hz: float) -> None:
     lead.jumped = jumped
 
 
-@compiled
+@inner
 def _swing(ring: Float, now: int, plan: Plan) -> float:
     """How far the latest samples swing about the line from their first to their last."""
     count = int(STILL_S * plan.rate_hz)
@@ -94,7 +94,7 @@ def _swing(ring: Float, now: int, plan: Plan) -> float:
     return high - low
 
 
-@compiled
+@inner
 def _watch_swing(lead: Lead, swing: float, now: int, rate_hz: float) -> None:
     """Hold the swing against that of the lead's stillest moments, and learn these."""
     stillest = min(lead.lowest_old, lead.lowest_older)
@@ -121,7 +121,7 @@ def _watch_swing(lead: Lead, swing: float, now: int, rate_hz: float) -> None:
         lead.epoch_end = now + EPOCH_S * rate_hz
 
 
-@compiled
+@inner
 def _is_lively(lead: Lead, swing: float, now: int, rate_hz: float) -> bool:
     """Whether a lead that is thought lost swings as unevenly as beats and what lies between do."""
     if swing == 0.0:
@@ -134,7 +134,7 @@ def _is_lively(lead: Lead, swing: float, now: int, rate_hz: float) -> bool:
     return bool(now > lead.quiet_from and swing > LIVELY * lead.quiet)
 
 
-@compiled
+@inner
 def shows_nothing(lead: Lead, now: int, rate_hz: float) -> bool:
     """Whether a lead is off, or has not settled since."""
     off = lead.run >= RUN_S * rate_hz and lead.jumped

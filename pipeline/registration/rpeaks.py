@@ -100,7 +100,7 @@ class RPeakDetector:
     not a number, a voltage that stays the same after a jump, less of a swing than the heart ever
     lets it have (``quality``), and noise all take a lead's say.
 
-    Make it before a loop begins: the first one on a machine compiles for half a minute or more.
+    Make it before a loop begins: the first one on a machine compiles for some 20 s.
 
     Parameters
     ----------

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from pipeline.registration.compiled import compiled
-from pipeline.registration.detector_state import T_STEP_S, T_STEPS, Plan, State
+from pipeline.registration.compiled import inner
+from pipeline.registration.detector_state import SHAPE_POINTS, T_STEP_S, T_STEPS, Plan, State
 from pipeline.registration.waves import ALIKE, measure_beat, smooth_window
 
 # A beat at all: is it higher than noise?
@@ -98,37 +98,37 @@ SPAN_S, RISE_S = 0.060, 0.012
 """Height is measured this far to either side of a wave's middle; steepness is change in so long."""
 
 
-@compiled
-def is_beat(since_s: float, height: float, overdue: bool, plan: Plan, s: State) -> bool:
+@inner
+def is_beat(since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Whether a wave so long after a beat is too high for noise and for that beat's T wave."""
-    if height < _t_wave_bar(since_s, overdue, plan, s):
+    if height < _t_wave_bar(since_s, plan, s):
         return False
     if _is_wide(since_s, height, plan, s):
         return True
-    return _exceeds(height, OVERDUE_SHARE * THRESHOLD if overdue else THRESHOLD, s)
+    return _exceeds(height, OVERDUE_SHARE * THRESHOLD if s.now[0].overdue else THRESHOLD, s)
 
 
-@compiled
-def resembles(at: int, since_s: float, height: float, overdue: bool, plan: Plan, s: State) -> bool:
+@inner
+def resembles(at: int, since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Measure a wave that may be a beat: does it look like one, or is it high enough besides?"""
     now = s.now[0]
     wave = s.found[now.found]
     measure_beat(at, wave, plan, s)
     if wave.likeness < VERY_ALIKE:
         again = _is_wide(since_s, height, plan, s) and _came_before(s)
-        return again or _exceeds(height, STRANGE_OVERDUE if overdue else STRANGE_THRESHOLD, s)
+        return again or _exceeds(height, STRANGE_OVERDUE if now.overdue else STRANGE_THRESHOLD, s)
     atrial = now.tall < SHORT and now.steep < BLUNT * now.tall
     return not atrial or _exceeds(height, ATRIAL_THRESHOLD, s)
 
 
-@compiled
+@inner
 def _exceeds(height: float, place: float, s: State) -> bool:
     """Whether a wave is higher than a place between the levels of noise (0) and of beats (1)."""
     between = s.now[0].between
     return height > between + place * (1.0 - between)
 
 
-@compiled
+@inner
 def _t_wave_until_s(overdue: bool, plan: Plan, s: State) -> float:
     """Until when after the last beat a wave is its T wave."""
     if overdue or _are_wide(s):
@@ -137,7 +137,7 @@ def _t_wave_until_s(overdue: bool, plan: Plan, s: State) -> float:
     return min(T_WAVE_S * slow, LATE_T_WAVE_S)
 
 
-@compiled
+@inner
 def _are_wide(s: State) -> bool:
     """Whether the usual beat is as wide as where a bundle branch is blocked: its T wave is late."""
     ratio, weights = 0.0, 0.0
@@ -149,17 +149,17 @@ def _are_wide(s: State) -> bool:
     return ratio < USUAL_WIDE * weights
 
 
-@compiled
+@inner
 def _last_was_wide(s: State) -> bool:
     """Whether the last beat was of another shape, or large: its T wave is large and may be late."""
     rhythm = s.now[0].rhythm
     return bool(rhythm.last_likeness < ALIKE or rhythm.last_height > LARGE)
 
 
-@compiled
-def _t_wave_bar(since_s: float, overdue: bool, plan: Plan, s: State) -> float:
+@inner
+def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
     """Height that a wave so long after a beat needs to be none of its T wave."""
-    now, until_s = s.now[0], _t_wave_until_s(overdue, plan, s)
+    now, until_s = s.now[0], _t_wave_until_s(s.now[0].overdue, plan, s)
     sharp = now.steep >= DULL * now.tall
     bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(now.rhythm.last_height, LARGE)
     if since_s < until_s:
@@ -167,7 +167,7 @@ def _t_wave_bar(since_s: float, overdue: bool, plan: Plan, s: State) -> float:
     return bar * (1.0 - (since_s - until_s) / FADE_S) if _last_was_wide(s) else 0.0
 
 
-@compiled
+@inner
 def _is_wide(since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Whether a wave after the last beat's T wave is tall and wide, as beats of a ventricle are."""
     now = s.now[0]
@@ -177,7 +177,7 @@ def _is_wide(since_s: float, height: float, plan: Plan, s: State) -> bool:
     return since_s > over_s and _exceeds(height, WIDE_THRESHOLD, s)
 
 
-@compiled
+@inner
 def _came_before(s: State) -> bool:
     """Whether the wave measured last looks like the wide wave before it, which it now replaces."""
     likeness, weights = 0.0, 0.0
@@ -186,11 +186,13 @@ def _came_before(s: State) -> bool:
         if lead.weight > 0.0:
             likeness += lead.weight * (lead.here.shape * lead.wide).sum()
             weights += lead.weight
-            lead.wide[:] = lead.here.shape
+            # Slices are filled by code of numba's that takes two seconds to compile.
+            for j in range(SHAPE_POINTS):
+                lead.wide[j] = lead.here.shape[j]
     return weights > 0.0 and likeness > AGAIN * weights
 
 
-@compiled
+@inner
 def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Whether a wave is dull and comes when such waves have come after the beats before; its time
     is noted."""
@@ -209,14 +211,14 @@ def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool
     return bool(known and expected)
 
 
-@compiled
+@inner
 def _is_duller_than_last(share: float, s: State) -> bool:
     """Whether a wave is less steep for its height than the last beat, by that factor."""
     now, rhythm = s.now[0], s.now[0].rhythm
     return bool(now.steep * rhythm.last_tall < share * (rhythm.last_steep * now.tall))
 
 
-@compiled
+@inner
 def learn_t_wave(s: State) -> None:
     """A beat that is no T wave ends the time in which those of the last one come."""
     rhythm = s.now[0].rhythm
@@ -228,7 +230,7 @@ def learn_t_wave(s: State) -> None:
     rhythm.t_height_now = 0.0
 
 
-@compiled
+@inner
 def last_may_be_p_wave(at: int, s: State) -> bool:
     """Whether the last beat was low and did not, as the heart's own, come when one was due; or the
     wave that was measured last is a beat beside which it is none."""
@@ -243,7 +245,7 @@ def last_may_be_p_wave(at: int, s: State) -> bool:
     return not own
 
 
-@compiled
+@inner
 def outdoes_last(since_s: float, height: float, s: State) -> bool:
     """Whether a wave is so much higher than the last beat, and sharper, as R is than P."""
     rhythm, now = s.now[0].rhythm, s.now[0]
@@ -251,7 +253,7 @@ def outdoes_last(since_s: float, height: float, s: State) -> bool:
     return height > AHEAD * rhythm.last_height and (since_s < AHEAD_S or duller)
 
 
-@compiled
+@inner
 def is_sharper_than_last(height: float, s: State) -> bool:
     """Whether a wave is as high as the last beat, and sharper than it, as R is than T."""
     rhythm, now = s.now[0].rhythm, s.now[0]
@@ -259,7 +261,7 @@ def is_sharper_than_last(height: float, s: State) -> bool:
     return bool(height >= rhythm.last_height and sharper)
 
 
-@compiled
+@inner
 def towers(height: float, s: State) -> bool:
     """Whether a beat is the second that shows all others so far to have been atrial waves."""
     if height < TOWERING or s.now[0].rhythm.beats > FIRST_BEATS:
@@ -268,7 +270,7 @@ def towers(height: float, s: State) -> bool:
     return s.now[0].towers == 2
 
 
-@compiled
+@inner
 def measure_stature(at: int, plan: Plan, s: State) -> None:
     """How tall and steep the wave at a sample is, in shares of the usual beat's; 1 if unknown."""
     tall, steep, weights = 0.0, 0.0, 0.0
@@ -289,7 +291,7 @@ def measure_stature(at: int, plan: Plan, s: State) -> None:
     s.now[0].sharp = sharp / seen if seen > 0.0 else 0.0
 
 
-@compiled
+@inner
 def learn_stature(first: int, last: int, plan: Plan, s: State) -> None:
     """First heights and steepnesses: those where a lead's energy is most like a beat's."""
     for k in range(len(s.leads)):
@@ -302,7 +304,7 @@ def learn_stature(first: int, last: int, plan: Plan, s: State) -> None:
         usual.tall, usual.steep = here.tall, here.steep
 
 
-@compiled
+@inner
 def _measure(k: int, at: int, plan: Plan, s: State) -> float:
     """Height and steepness of one lead about a sample, in its own units; and how sharp it is: its
     largest change in half a rise as a share of that in a whole one."""

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import asked, inner
 
 R_AFTER_Q_S = 0.04
 SLOWEST_BPM, FASTEST_BPM = 45.0, 120.0
@@ -57,7 +57,7 @@ BEFORE = RINGS + 2 * KEPT
 SIZE = 2 * BEFORE - STATE
 
 
-@compiled
+@asked
 def systole_share(rr_s: float) -> float:
     """Share of a beat from the R peak to the closure of the aortic valve."""
     rate = min(max(60.0 / rr_s, SLOWEST_BPM), FASTEST_BPM)
@@ -65,13 +65,13 @@ def systole_share(rr_s: float) -> float:
     return length_s * min(1.0, rr_s * FASTEST_BPM / 60.0) / rr_s
 
 
-@compiled
+@asked
 def kick_phase(rr_s: float) -> float:
     """Share of a beat after which the atria contract, a fixed time before the next R peak."""
     return 1.0 - KICK_S / max(rr_s, 60.0 / FASTEST_BPM)
 
 
-@compiled
+@asked
 def to_cycle(phase: float, rr_s: float, cycle_rr_s: float) -> float:
     """Phase of a beat of ``rr_s`` on the axis of a beat of ``cycle_rr_s``.
 
@@ -91,13 +91,13 @@ def to_cycle(phase: float, rr_s: float, cycle_rr_s: float) -> float:
     return place if place < 1.0 else 0.0
 
 
-@compiled
+@asked
 def wrapped(turns: float) -> float:
     """The same angle in [-0.5, 0.5)."""
     return turns - math.floor(turns + 0.5)
 
 
-@compiled
+@asked
 def reset(c: Float, cycle_rr_s: float, fade_per_s: float, latency_s: float) -> None:
     """A clock that has seen nothing; all three are sound."""
     for i in range(SIZE):
@@ -108,7 +108,7 @@ def reset(c: Float, cycle_rr_s: float, fade_per_s: float, latency_s: float) -> N
     _forget(c)
 
 
-@compiled
+@inner
 def _forget(c: Float) -> None:
     """Know of no beat, as at the start; the time and what is rendered stay."""
     for i in range(RINGS, BEFORE):
@@ -120,29 +120,29 @@ def _forget(c: Float) -> None:
     c[BEFORE:] = c[STATE:BEFORE]
 
 
-@compiled
+@asked
 def tolerance(c: Float) -> float:
     """How far from its predicted time a regular beat may come, seconds."""
     return float(min(max(REGULAR_SHARE * c[RR], 3.0 * c[SPREAD]), MOST_SHARE * c[RR]))
 
 
-@compiled
+@inner
 def _slot(c: Float, back: int) -> int:
     return RINGS + int(c[COUNT] - 1.0 - back + KEPT) % KEPT
 
 
-@compiled
+@asked
 def interval(c: Float, back: int) -> float:
     """The interval ``back`` before the latest (0)."""
     return float(c[_slot(c, back)])
 
 
-@compiled
+@inner
 def _was_regular(c: Float, back: int) -> bool:
     return bool(c[_slot(c, back) + KEPT] > 0.0)
 
 
-@compiled
+@asked
 def beat(c: Float, r_s: float, strange: bool) -> int:
     """An R peak became known; what kind of beat it is, or -1 if it does not count: it is no later
     than the last, or too far ahead of all that the clock was told."""
@@ -175,7 +175,7 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     return ECTOPIC_BEAT if early and not settled else NORMAL_BEAT
 
 
-@compiled
+@asked
 def take_back(c: Float) -> None:
     """The last beat was none: know what was known before it."""
     # Leads that were lost since are not to be forgotten.
@@ -183,7 +183,7 @@ def take_back(c: Float) -> None:
         c[STATE:BEFORE] = c[BEFORE:]
 
 
-@compiled
+@inner
 def _latest(c: Float) -> float:
     """The latest time that the clock was told of, by a question or by a beat."""
     if c[STARTED] > 0.0 and c[BEATS] > 0.0:
@@ -191,7 +191,7 @@ def _latest(c: Float) -> float:
     return float(c[NOW] if c[STARTED] > 0.0 else c[LAST_R])
 
 
-@compiled
+@inner
 def _judge(c: Float, regular: bool, off_s: float) -> bool:
     """What the rhythm is with its latest interval, and when the next beat is due; whether the last
     intervals agree (:func:`_settled`)."""
@@ -215,7 +215,7 @@ def _judge(c: Float, regular: bool, off_s: float) -> bool:
     return steady
 
 
-@compiled
+@inner
 def _settled(c: Float) -> bool:
     """Whether the last three intervals agree, so that a new rate has come to stay."""
     if c[COUNT] < 3.0:
@@ -228,7 +228,7 @@ def _settled(c: Float) -> bool:
     return high - low <= REGULAR_SHARE * high
 
 
-@compiled
+@asked
 def irregularity(c: Float) -> float:
     """Step between intervals, as a share of their mean, that two thirds of the last nine exceed.
 
@@ -245,14 +245,14 @@ def irregularity(c: Float) -> float:
     return min(_usual_step(c, count, 1), _usual_step(c, count, 2)) / mean
 
 
-@compiled
+@inner
 def _own(c: Float, count: int, back: int) -> bool:
     """Whether an interval lies between two beats of the usual shape."""
     before = back + 1 < count and c[_slot(c, back + 1) + KEPT] < 0.0
     return not (before or c[_slot(c, back) + KEPT] < 0.0)
 
 
-@compiled
+@inner
 def _usual_step(c: Float, count: int, lag: int) -> float:
     """Size that a third of the steps between intervals ``lag`` apart stay under."""
     steps = np.empty(10)
@@ -266,7 +266,7 @@ def _usual_step(c: Float, count: int, lag: int) -> float:
     return float(np.sort(steps[:used])[(35 * (used - 1)) // 100])
 
 
-@compiled
+@inner
 def _predict(c: Float) -> None:
     """The next interval: what two before it say, by the latest regular ones (least squares).
 
@@ -300,14 +300,14 @@ def _predict(c: Float) -> None:
     c[RR] = mean + min(max(step, -0.2 * mean), 0.2 * mean)
 
 
-@compiled
+@inner
 def _place(c: Float, now_s: float, rr_s: float) -> float:
     """Where the heart should be, if the interval is ``rr_s`` and the next beats come as due."""
     turns = (now_s - c[LAST_R]) / rr_s
     return to_cycle(turns - math.floor(turns), rr_s, c[CYCLE_RR])
 
 
-@compiled
+@asked
 def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
     """Bring the clock to ``now_s``; -1 when that is no time at or after the last.
 
@@ -330,7 +330,7 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
     return 0
 
 
-@compiled
+@inner
 def _lose_time(c: Float, now_s: float) -> None:
     """A time that is none, or of another clock: what beats told of is worth nothing any more."""
     if math.isfinite(now_s) and now_s >= c[NOW] - SLACK_S:
@@ -342,7 +342,7 @@ def _lose_time(c: Float, now_s: float) -> None:
         c[NOW] = now_s
 
 
-@compiled
+@inner
 def _watch(c: Float, now_s: float, usable: bool) -> None:
     """Notice that no lead shows anything, or that a beat is overdue."""
     waited_s = now_s - c[LAST_R]
@@ -358,7 +358,7 @@ def _watch(c: Float, now_s: float, usable: bool) -> None:
         c[GOOD], c[VALID] = 0.0, 0.0
 
 
-@compiled
+@inner
 def _turn(c: Float, before_s: float, now_s: float) -> None:
     """Move the phase towards where the beats say, and judge it."""
     place = _place(c, now_s, c[RR])
@@ -385,7 +385,7 @@ def _turn(c: Float, before_s: float, now_s: float) -> None:
     )
 
 
-@compiled
+@asked
 def to_cycle_all(phases: Float, rr_s: Float, cycle_rr_s: float, out: Float) -> None:
     """:func:`to_cycle` of each of ``(n,)`` phases and intervals."""
     for i in range(len(phases)):

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import compiled
+from pipeline.registration.compiled import inner
 from pipeline.registration.detector_state import SHAPE_POINTS, Found, Here, Plan, State, Usual
 
 BEFORE_S, AFTER_S = 0.130, 0.100
@@ -37,7 +37,7 @@ TURNED = 0.05
 """The usual direction changes when on average the other one is larger by this share."""
 
 
-@compiled
+@inner
 def smooth_window(
     ring: Float, length: int, middle: int, before: int, after: int, kernel: Float
 ) -> Float:
@@ -53,7 +53,7 @@ def smooth_window(
     return out
 
 
-@compiled
+@inner
 def vertex(before: float, at: float, after: float) -> float:
     """Where the parabola through three samples peaks, in samples from the middle one.
 
@@ -66,7 +66,7 @@ def vertex(before: float, at: float, after: float) -> float:
     return 0.5 * (before - after) / bend
 
 
-@compiled
+@inner
 def above_rest(window: Float, before: int, rate_hz: float) -> Float:
     """The window less the line from before the QRS complex to after it: without drift."""
     early = max(1, before - int(REST_BEFORE_S * rate_hz))
@@ -78,7 +78,7 @@ def above_rest(window: Float, before: int, rate_hz: float) -> Float:
     return away
 
 
-@compiled
+@inner
 def deflection(away: Float, bend: Float, side: float) -> int:
     """Sample of the largest deflection to one side (1 up, -1 down).
 
@@ -99,7 +99,7 @@ def deflection(away: Float, bend: Float, side: float) -> int:
     return place
 
 
-@compiled
+@inner
 def summit(ring: Float, length: int, at: int, sign: float, kernel: Float, reach: int) -> float:
     """Where the smoothed signal peaks nearest to sample ``at``, in samples from it."""
     window = smooth_window(ring, length, at, reach + 1, reach + 1, kernel)
@@ -112,7 +112,7 @@ def summit(ring: Float, length: int, at: int, sign: float, kernel: Float, reach:
     return i - (reach + 1) + shift
 
 
-@compiled
+@inner
 def read_shape(
     ring: Float, length: int, peak: float, rate_hz: float, kernel: Float, shape: Float
 ) -> None:
@@ -133,7 +133,7 @@ def read_shape(
             shape[k] /= size
 
 
-@compiled
+@inner
 def measure_beat(at: int, wave: Found, plan: Plan, s: State) -> None:
     """Time R by all leads that show it, and compare its shape with the usual one."""
     likeness, weights, best = 0.0, 0.0, 0
@@ -152,7 +152,7 @@ def measure_beat(at: int, wave: Found, plan: Plan, s: State) -> None:
     wave.time_s = (at + _common_time(wave.likeness >= ALIKE, s)) / plan.rate_hz
 
 
-@compiled
+@inner
 def _time_lead(k: int, at: int, plan: Plan, s: State) -> float:
     """When a lead's main deflection peaks, in samples after the complex's middle.
 
@@ -179,7 +179,7 @@ def _time_lead(k: int, at: int, plan: Plan, s: State) -> float:
     return _refine(k, at, place, peak, abs(away[around + place]), plan, s)
 
 
-@compiled
+@inner
 def _climb(k: int, at: int, away: Float, bend: Float, plan: Plan, s: State) -> tuple[int, float]:
     """The largest deflection to a lead's side, and the summit near it, in samples after the
     complex's middle; and the shape about it."""
@@ -190,7 +190,7 @@ def _climb(k: int, at: int, away: Float, bend: Float, plan: Plan, s: State) -> t
     return place, peak
 
 
-@compiled
+@inner
 def _refine(k: int, at: int, place: int, peak: float, size: float, plan: Plan, s: State) -> float:
     """The peak with what smoothing moves it by, which is the same in every beat; noise is not."""
     here, usual = s.leads[k].here, s.leads[k].usual
@@ -204,7 +204,7 @@ def _refine(k: int, at: int, place: int, peak: float, size: float, plan: Plan, s
     return peak + usual.shift / (1.0 + (usual.scatter / (0.001 * plan.rate_hz)) ** 2)
 
 
-@compiled
+@inner
 def _common_time(usual: bool, s: State) -> float:
     """One time of the leads that agree with the best one.
 
@@ -227,12 +227,12 @@ def _common_time(usual: bool, s: State) -> float:
     return _lower_median(peaks[:count]) if count else 0.0
 
 
-@compiled
+@inner
 def _lower_median(values: Float) -> float:
     return float(np.sort(values)[(len(values) - 1) // 2])
 
 
-@compiled
+@inner
 def learn_beat(at: int, wave: Found, anew: bool, plan: Plan, s: State) -> None:
     """Let what is usual follow the beat that was measured last, or be that beat."""
     if at < BEFORE_S * plan.rate_hz:
@@ -244,7 +244,7 @@ def learn_beat(at: int, wave: Found, anew: bool, plan: Plan, s: State) -> None:
         _learn_shapes(wave.time_s * plan.rate_hz - at, anew or not usual, plan, s)
 
 
-@compiled
+@inner
 def _patience(s: State) -> float:
     """How many beats of other shapes make another shape the usual one: few, where few are known."""
     known = 0.0
@@ -253,7 +253,7 @@ def _patience(s: State) -> float:
     return min(known + 1.0, float(FORGET_SHAPE))
 
 
-@compiled
+@inner
 def _learn_shapes(together: float, anew: bool, plan: Plan, s: State) -> None:
     """Let the usual shape, direction and offset of every lead follow this beat, or be its own."""
     for lead in s.leads:
@@ -281,7 +281,7 @@ def _learn_shapes(together: float, anew: bool, plan: Plan, s: State) -> None:
     _centre_offsets(s)
 
 
-@compiled
+@inner
 def _learn_size(here: Here, usual: Usual, rate_hz: float) -> None:
     """How high beats are, and by how much smoothing moves their summit."""
     if usual.timed == 0.0:
@@ -293,7 +293,7 @@ def _learn_size(here: Here, usual: Usual, rate_hz: float) -> None:
     usual.size_mv += 0.1 * (here.size_mv - usual.size_mv)
 
 
-@compiled
+@inner
 def _follow(usual: float, here: float, anew: bool) -> float:
     """A usual height or steepness after a beat; slowly downwards, for low waves may be none."""
     if anew or usual <= 0.0:
@@ -301,7 +301,7 @@ def _follow(usual: float, here: float, anew: bool) -> float:
     return usual + (GROW if here > usual else SHRINK) * (here - usual)
 
 
-@compiled
+@inner
 def _centre_offsets(s: State) -> None:
     """Offsets are against the earlier half of the leads, for S follows R; on average, not once."""
     offsets, count, fewest = np.empty(len(s.leads)), 0, np.inf
