@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import inner
+from pipeline.registration.compiled import asked, inner
 from pipeline.registration.detector_state import SHAPE_POINTS, Found, Here, Plan, State, Usual
 
 BEFORE_S, AFTER_S = 0.130, 0.100
@@ -53,7 +53,7 @@ def smooth_window(
     return out
 
 
-@inner
+@asked
 def vertex(before: float, at: float, after: float) -> float:
     """Where the parabola through three samples peaks, in samples from the middle one.
 
