@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from scipy.sparse.csgraph import connected_components
 
 from pipeline import __version__
@@ -31,7 +31,7 @@ from pipeline.progress import Progress
 from pipeline.publish import only_run_in, publishing, sha256_of
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
-from pipeline.validation import describe_validation
+from pipeline.validation import Section, describe_validation
 
 SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
 """From end to end; a heart in metres or micrometres lies outside."""
@@ -43,10 +43,8 @@ ones: single precision, in which files may hold them, does less by far."""
 NUMBERED = re.compile(r"(?P<structure>.+)_(?P<number>\d+)")
 
 
-class Timing(BaseModel):
+class Timing(Section):
     """What ``phases.json`` beside the surfaces may say."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     phases: tuple[float, ...] | None = None
     """Rising within [0, 1), one a file; evenly spaced from 0 when left out."""

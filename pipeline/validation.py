@@ -26,11 +26,23 @@ class Section(BaseModel):
     def _is_no_truth(cls, given: Any) -> Any:
         """The library takes true for the number 1, which nobody means by it."""
         for name, field in cls.model_fields.items() if isinstance(given, dict) else ():
-            value = given.get(field.alias or name)
-            kinds = {field.annotation, *get_args(field.annotation)}
-            if isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
-                raise ValueError(f"{name} is {str(value).lower()}; needs a number")
+            kinds = _kinds(field.annotation)
+            truth = find_truth(given.get(field.alias or name))
+            if truth is not None and bool not in kinds and kinds & {int, float}:
+                raise ValueError(f"{name}: {str(truth).lower()} is no number")
         return given
+
+
+def find_truth(value: Any) -> bool | None:
+    """The first true or false among what a user wrote, lists looked into; None if there is none."""
+    if isinstance(value, list | tuple):
+        return next((one for one in map(find_truth, value) if one is not None), None)
+    return value if isinstance(value, bool) else None
+
+
+def _kinds(annotation: Any) -> set[Any]:
+    """The types that an annotation is made of."""
+    return {annotation}.union(*map(_kinds, get_args(annotation)))
 
 
 def describe_validation(

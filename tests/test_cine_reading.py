@@ -187,6 +187,7 @@ def test_a_timing_file_gives_each_slice_its_own_heartbeat(tmp_path: Path) -> Non
         ('{"trigger_times_ms": [[0, 1], [0]], "rr_ms": 8}', "is a list of 2 lists of 1 or 2"),
         ('{"trigger_time_ms": [0], "rr_ms": 800}', "it holds trigger_time_ms, rr_ms"),
         ('{"trigger_times_ms": [0, 1, 2, 3, 4], "rr_ms": "fast"}', "rr_ms is 'fast'"),
+        ('{"trigger_times_ms": [0, true, 2, 3, 4], "rr_ms": 800}', "_ms holds true"),
         ('{"trigger_times_ms": [0, 200, 100, 300, 400], "rr_ms": 800}', "must rise"),
         ('{"trigger_times_ms": [0, 0.1, 0.2, 0.3, 0.4], "rr_ms": 800}', "are both in milliseconds"),
         ('{"trigger_times_ms": [0, 200, 400, 600, 900], "rr_ms": 800}', "do not fit"),

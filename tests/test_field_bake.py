@@ -378,6 +378,7 @@ def inward_box(folder):
         (lambda f: save(f / "ball" / "x.vtp", sphere(5, 2)), r"x\.vtp: in a structure's folder"),
         (lambda f: (f / "phases.json").write_text('{"phases": [0, 0.5]}'), "2 phases for 3"),
         (lambda f: (f / "phases.json").write_text('{"phase": []}'), "unknown key"),
+        (lambda f: (f / "phases.json").write_text('{"rr_s": true}'), "rr_s: true is no number"),
         (lambda f: (f / "phases.json").write_text('{"phases": [0, 30, 60]}'), r"s\.json: .*rise"),
         (lambda f: (f / "phases.json").write_text('{"rr_s": 800}'), "rr_s: .* equal to 60"),
         (

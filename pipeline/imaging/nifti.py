@@ -21,6 +21,7 @@ from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
+from pipeline.validation import find_truth
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -356,6 +357,9 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
         raise InputError(f"{path}: {needed}; it holds {found or 'nothing'}{evenly}")
     given = []
     for key, shape in (("trigger_times_ms", (slices, phases)), ("rr_ms", (slices,))):
+        truth = find_truth(content[key])
+        if truth is not None:
+            raise InputError(f"{path}: {needed}; {key} holds {str(truth).lower()}")
         try:
             numbers = np.asarray(content[key], dtype=float)
             given.append(np.broadcast_to(numbers, shape))
