@@ -140,7 +140,7 @@ def vtk(surface: Surface, grid: Grid) -> Way:
     """VTK's implicit distance, for every 61st node."""
     import vtkmodules.vtkFiltersCore  # noqa: F401
 
-    from pipeline.field.exact import ExactSurface
+    from pipeline.exact import ExactSurface
 
     def ready() -> tuple[ExactSurface, Float]:
         exact, points = ExactSurface(surface), grid.nodes_mm().reshape(-1, 3)[::VTK_SHARE]

@@ -9,10 +9,10 @@ import pytest
 import pyvista
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from pipeline.exact import ExactSurface
 from pipeline.field import BakeSettings, ForceField
 from pipeline.field.bake import bake_field
 from pipeline.field.distance import distance_of_closed
-from pipeline.field.exact import vtk_distance
 from pipeline.field.fixture import DEFAULT_FIXTURES
 from pipeline.geometry import Grid, MovingSurface, Surface
 
@@ -58,7 +58,7 @@ def test_mesh_to_grid(benchmark: BenchmarkFixture, who: str, level: int) -> None
     ours = benchmark.pedantic(
         (lambda: distance_of_closed(surface, grid).ravel()[::VTK_SHARE])
         if who == "ours"
-        else (lambda: vtk_distance(surface, some)),
+        else (lambda: ExactSurface(surface).distance_mm(some)),
         rounds=3,
         warmup_rounds=1,
     )

@@ -24,10 +24,10 @@ import segmentation_tables as tables
 from data_synth.heart import BeatingHeart
 from data_synth.simulate import load_heart, settings_of
 from pipeline.evaluation.metrics import surface_samples
+from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface
 from pipeline.meshes import read_mesh
 from pipeline.products import read_cine, read_surfaces
-from pipeline.surface.measures import signed_distances_mm
 
 Names = npt.NDArray[np.str_]
 Mask = npt.NDArray[np.bool_]
@@ -166,7 +166,7 @@ def points_of(
         on_found, on_known = (surface_samples(one, SAMPLES) for one in (found, known))
         # Outside truth is too large; where truth's own point lies outside, it is too small.
         off_mm = np.concatenate(
-            [signed_distances_mm(on_found, known), -signed_distances_mm(on_known, found)]
+            [ExactSurface(known).distance_mm(on_found), -ExactSurface(found).distance_mm(on_known)]
         )
         both_mm = np.concatenate([on_found, on_known])
         lies = places(name, heart, both_mm, float(phase))

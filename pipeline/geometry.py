@@ -156,6 +156,12 @@ class Surface:
         return np.asarray(directed[~good])
 
 
+def area_vectors(corners: Float) -> Float:
+    """Normals ``(n, 3)`` of triangles ``(n, 3, 3)``, each twice as long as its area is large."""
+    first, second, third = corners[:, 0], corners[:, 1], corners[:, 2]
+    return np.asarray(np.cross(second - first, third - first))
+
+
 @dataclass(frozen=True, slots=True)
 class MovingSurface:
     """One surface through the beat: vertex i is the same material point in every phase."""

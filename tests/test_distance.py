@@ -20,8 +20,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
+from pipeline.exact import ExactSurface
 from pipeline.field.distance import distance_of_closed, require_closed
-from pipeline.field.exact import vtk_distance
 from pipeline.geometry import Float, Grid, Integer, Surface
 
 EPSILON = float(np.finfo(np.float32).eps)
@@ -134,7 +134,7 @@ def test_triangles_without_area_change_nothing():
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_agrees_with_vtk(seed):
     surface, grid = lumpy(seed), cube_grid(40, 16)
-    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
+    exact = ExactSurface(surface).distance_mm(grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
     found = distance_of_closed(surface, grid)
 
@@ -201,7 +201,7 @@ def test_moving_surface_and_points_together_changes_nothing(seed, turn, shift):
     origin = tuple(np.add(around.origin_mm, shift))
     grid = Grid(around.shape, origin, around.spacing_mm)
     carried_back = (grid.nodes_mm().reshape(-1, 3) - shift) @ rotation
-    exact = vtk_distance(surface, carried_back).reshape(grid.shape)
+    exact = ExactSurface(surface).distance_mm(carried_back).reshape(grid.shape)
 
     found = distance_of_closed(moved(surface, rotation, np.array(shift)), grid)
 
@@ -233,7 +233,7 @@ def test_many_small_triangles_agree_with_vtk(spacing):
     surface = lumpy(11, level=5, radius=15.0)
     grid = Grid(shape, (-26.0, -25.5, -25.2), spacing)
     some = some_nodes(grid, 1500)
-    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)[some])
+    exact = ExactSurface(surface).distance_mm(grid.nodes_mm().reshape(-1, 3)[some])
 
     found = distance_of_closed(surface, grid).ravel()[some]
 
@@ -249,7 +249,8 @@ def test_wall_of_half_a_millimetre_keeps_its_sign_and_distance():
     radius = np.linalg.norm(points, axis=1)
     # All nodes about the wall, and some of the others.
     some = np.union1d(np.flatnonzero(np.abs(radius - 19.75) < 0.5), some_nodes(grid, 1000))
-    exact = np.maximum(vtk_distance(outer, points[some]), -vtk_distance(inner, points[some]))
+    in_outer, in_inner = (ExactSurface(one).distance_mm(points[some]) for one in (outer, inner))
+    exact = np.maximum(in_outer, -in_inner)
 
     found = distance_of_closed(wall, grid).ravel()[some]
 
@@ -261,7 +262,7 @@ def test_wall_of_half_a_millimetre_keeps_its_sign_and_distance():
 def test_nodes_as_far_from_everything_find_the_nearest():
     """About the middle of a ball all 20,480 triangles are within a hair of the nearest."""
     surface, grid = sphere(25.0, 5), Grid((6, 7, 8), (-0.03, -0.02, -0.05), (0.01, 0.01, 0.01))
-    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
+    exact = ExactSurface(surface).distance_mm(grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
     found = distance_of_closed(surface, grid)
 
@@ -270,7 +271,7 @@ def test_nodes_as_far_from_everything_find_the_nearest():
 
 def test_surface_wholly_outside_the_grid():
     surface, grid = lumpy(2), Grid((9, 8, 7), (200.0, -350.0, 90.0), (1.0, 2.0, 0.5))
-    exact = vtk_distance(surface, grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
+    exact = ExactSurface(surface).distance_mm(grid.nodes_mm().reshape(-1, 3)).reshape(grid.shape)
 
     found = distance_of_closed(surface, grid)
 

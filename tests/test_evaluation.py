@@ -20,11 +20,11 @@ from pipeline.evaluation.metrics import (
     surface_samples,
     target_registration_error_mm,
 )
+from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
 from pipeline.surface.measures import (
     distances_mm,
     ejection_fraction,
-    signed_distances_mm,
     volumes_ml,
 )
 
@@ -100,7 +100,7 @@ def test_distance_to_a_cube_is_exact_and_signed():
     points = np.random.default_rng(1).uniform(-20, 30, (500, 3))
     q = np.abs(points - 5.0) - 5.0
     exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
-    np.testing.assert_allclose(signed_distances_mm(points, box(10.0)), exact, atol=1e-9)
+    np.testing.assert_allclose(ExactSurface(box(10.0)).distance_mm(points), exact, atol=1e-9)
 
 
 def test_distances_survive_coordinates_that_single_precision_would_round():

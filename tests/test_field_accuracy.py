@@ -12,10 +12,10 @@ from field_shapes import beating, box, sphere
 from data_synth.population import draw_heart
 from pipeline.config import Settings
 from pipeline.errors import InputError
+from pipeline.exact import points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
-from pipeline.field.exact import points_about
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface, Surface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field

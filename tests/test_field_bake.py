@@ -13,9 +13,9 @@ from field_shapes import beating, box, lumpy, sag, sphere
 from pipeline.cli import main
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
+from pipeline.exact import ExactSurface, points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
-from pipeline.field.exact import points_about, vtk_distance
 from pipeline.field.fixture import Bounds
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
@@ -50,7 +50,7 @@ def test_certificate_is_what_an_independent_check_finds(tmp_path):
 
     field = ForceField.open(tmp_path / "f.zarr")
     asked = points_about(surface, np.random.default_rng(99), 4000, 15.0)
-    error = np.abs(field.distance_mm(asked, 0) - vtk_distance(surface, asked))
+    error = np.abs(field.distance_mm(asked, 0) - ExactSurface(surface).distance_mm(asked))
     assert said == field.accuracy
     assert said["sign_errors"] == 0
     # Stored as float32 of at most 40 mm.

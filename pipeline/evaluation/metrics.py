@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array, csgraph
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Surface, transform_points
+from pipeline.geometry import Float, Surface, area_vectors, transform_points
 from pipeline.surface.measures import distances_mm
 
 
@@ -84,7 +84,7 @@ def surface_samples(surface: Surface, count: int, seed: int = 0) -> Float:
     noise than independent draws); within its triangle the point is uniform.
     """
     a, b, c = (surface.vertices_mm[surface.triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(area_vectors(surface.vertices_mm[surface.triangles]), axis=1)
     rng = np.random.default_rng(seed)
     share = (np.arange(count) + rng.random(count)) / count
     edges = np.cumsum(area) / area.sum()

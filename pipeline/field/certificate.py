@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.field.exact import ExactSurface, points_about
+from pipeline.exact import ExactSurface, points_about
 from pipeline.field.fixture import Bounds, Fixture
 from pipeline.field.motion import BeatingSurface, Motion, halfway
 from pipeline.field.reader import ForceField

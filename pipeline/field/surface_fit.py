@@ -21,7 +21,15 @@ from numba import njit
 
 from pipeline.field.motion import BeatingSurface, Motion, between
 from pipeline.field.spline import phase_weights, timeline
-from pipeline.geometry import Float, Float32, Grid, Integer, Surface, spread_over_triangle
+from pipeline.geometry import (
+    Float,
+    Float32,
+    Grid,
+    Integer,
+    Surface,
+    area_vectors,
+    spread_over_triangle,
+)
 
 MOMENTS_A_PHASE = 3
 POINTS_A_CELL = 2.0
@@ -119,8 +127,7 @@ def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
     its edges: ``(n, 3)`` vertex numbers and their shares."""
     triangles = surface.triangles
     corners_mm = surface.vertices_mm[triangles]
-    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    area = np.cumsum(np.linalg.norm(across, axis=1)) / 2
+    area = np.cumsum(np.linalg.norm(area_vectors(corners_mm), axis=1)) / 2
     count = int(np.ceil(POINTS_A_CELL * area[-1] / step_mm**2))
     chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
     sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))

@@ -22,6 +22,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import (
     Float,
     Grid,
+    area_vectors,
     require_rigid,
     spread_over_triangle,
     transform_points,
@@ -207,8 +208,7 @@ def _corners_mm(path: Path) -> Float:
 
 def spread_points(corners_mm: Float, count: int, where: str = "a tool's mesh") -> Float:
     """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time."""
-    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    area = np.linalg.norm(across, axis=1)
+    area = np.linalg.norm(area_vectors(corners_mm), axis=1)
     if not area.sum() > 0:
         raise InputError(f"{where}: has no area; give triangles that have some")
     chosen = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(count) + 0.5) / count)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from pipeline.geometry import Float, Integer, MovingSurface
+from pipeline.geometry import Float, Integer, MovingSurface, area_vectors
 from pipeline.report.animation import HEAD, TOWARDS_VIEWER
 from pipeline.report.colours import SOLID_COLOURS
 
@@ -69,7 +69,7 @@ def seen_from(corners_mm: Float, towards_viewer: Float) -> tuple[Integer, Float,
     right = np.cross(HEAD, towards)
     right /= np.linalg.norm(right)
     up = np.cross(towards, right)
-    normal = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    normal = area_vectors(corners_mm)
     length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
     squareness = normal @ towards / length
     facing = np.flatnonzero(squareness > 0)

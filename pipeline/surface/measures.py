@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, Mask, MovingSurface, Surface
 from pipeline.surface.mesh import vertex_areas, vertex_normals
 
@@ -199,24 +200,7 @@ def segment_names(inner: Surface, walled: Mask, axis: Float, right: Surface | No
 
 def distances_mm(points_mm: Float, surface: Surface) -> Float:
     """Distance ``(n,)`` from points to the nearest point of a surface's triangles, unsigned."""
-    return np.abs(signed_distances_mm(points_mm, surface))
-
-
-def signed_distances_mm(points_mm: Float, surface: Surface) -> Float:
-    """Signed distance ``(n,)`` from points to the nearest point of a surface's triangles.
-
-    VTK's search over exact point-to-triangle distances; negative inside a closed, outward surface.
-    """
-    import pyvista
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkDoubleArray
-    from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-
-    distance = vtkImplicitPolyDataDistance()
-    distance.SetInput(pyvista.PolyData.from_regular_faces(surface.vertices_mm, surface.triangles))
-    values = vtkDoubleArray()
-    distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points_mm, np.float64)), values)
-    return np.array(vtk_to_numpy(values))
+    return np.abs(ExactSurface(surface).distance_mm(points_mm))
 
 
 def _to_wall(points_mm: Float, outer: Surface, axis: Float | None) -> Float:

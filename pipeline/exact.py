@@ -1,4 +1,4 @@
-"""Exact distances by VTK, to measure a baked field by: it shares no code with the baking."""
+"""Exact distances by VTK, to measure surfaces and baked fields by; baking uses none of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry import Float, Surface
+from pipeline.geometry import Float, Surface, area_vectors
 
 
 class ExactSurface:
@@ -53,16 +53,10 @@ class ExactSurface:
         return distance_mm, nearest_mm
 
 
-def vtk_distance(surface: Surface, points_mm: Float) -> Float:
-    """Exact signed distance of ``(n, 3)`` points to a closed surface, negative inside, mm."""
-    return ExactSurface(surface).distance_mm(points_mm)
-
-
 def points_about(surface: Surface, rng: np.random.Generator, count: int, band_mm: float) -> Float:
     """Random points at most ``band_mm`` from a surface: ``(count, 3)``, uniform over its area."""
     corners = surface.vertices_mm[surface.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
+    area = np.linalg.norm(area_vectors(corners), axis=1)
     chosen = corners[rng.choice(len(area), size=count, p=area / area.sum())]
     weights = rng.dirichlet(np.ones(3), size=count)
     direction = rng.normal(size=(count, 3))
