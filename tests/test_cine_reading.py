@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -263,6 +264,23 @@ def test_a_placement_that_is_none_is_told_with_the_other(
     nibabel.save(image, tmp_path / "spoilt.nii")
     with pytest.raises(InputError, match=rf"its sform .*{words}.* set sform_code to 0"):
         read_nifti_cine(tmp_path / "spoilt.nii", None)
+
+
+def test_voxels_without_a_size_are_refused_where_nothing_else_tells_it(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """At these bytes a header says them: nifti1.h."""
+    nifti_cine(tmp_path / "cine.nii", np.diag([1.5, 1.5, 8, 1]))
+    whole = bytearray((tmp_path / "cine.nii").read_bytes())
+    struct.pack_into("<f", whole, 80, 0.0)
+    (tmp_path / "cine.nii").write_bytes(whole)
+    by_sform = read_nifti_cine(tmp_path / "cine.nii", None).cine.mr_from_index
+    np.testing.assert_allclose(np.abs(np.diag(by_sform)), [1.5, 1.5, 8, 1])
+    struct.pack_into("<hh", whole, 252, 1, 0)
+    (tmp_path / "cine.nii").write_bytes(whole)
+    with pytest.raises(InputError, match=r"no size of voxels \(pixdim \[0\.0, 1\.5, 8\.0\]"):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+    assert capfd.readouterr() == ("", "")
 
 
 def placed(path: Path, sform: int, qform: int, apart_mm: float = 0.0) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import logging
 import math
 import zlib
 from pathlib import Path
@@ -13,6 +14,8 @@ import nibabel
 import numpy as np
 import numpy.typing as npt
 from nibabel.filebasedimages import ImageFileError
+from nibabel.imageglobals import logger as _told_mends
+from nibabel.openers import ImageOpener
 from nibabel.spatialimages import HeaderDataError
 
 from pipeline.errors import InputError
@@ -22,6 +25,9 @@ from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.validation import find_truth
+
+# The library mends headers and tells people so, in words of its own; what matters of it is refused.
+_told_mends.setLevel(logging.CRITICAL)
 
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -205,11 +211,19 @@ def _load(path: Path) -> Any:
         image: Any = nibabel.load(path)
         # A damaged placement shows when it is asked for.
         image.get_qform(coded=True)
+        with ImageOpener(path) as stream:
+            as_stored = type(image.header).from_fileobj(stream, check=False)
     except (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, zlib.error) as error:
         raise InputError(
             f"{path}: cannot be read as NIfTI ({error}); copy or convert it again"
         ) from error
     require_bounded(math.prod(int(size) for size in image.shape), str(path))
+    edges_mm = as_stored["pixdim"][1:4]
+    if as_stored["sform_code"] <= 0 and not np.all(np.abs(edges_mm) > 0):
+        raise InputError(
+            f"{path}: its header tells no size of voxels (pixdim {edges_mm.tolist()}, and no "
+            "sform); convert the scanner's own files again"
+        )
     if image.get_data_dtype().kind == "V":
         raise InputError(f"{path}: its voxels are colours; store one grey value a voxel")
     if image.get_data_dtype().kind == "c":
