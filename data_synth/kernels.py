@@ -33,7 +33,10 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     usual = config.CACHE_DIR
     config.CACHE_DIR = str(Path(usual or Path(__file__).parent / "__pycache__") / _digest())
     try:
-        return cast("Callable[Parameters, Result]", njit(cache=True, nogil=True)(function))
+        return cast(
+            "Callable[Parameters, Result]",
+            njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function),
+        )
     finally:
         config.CACHE_DIR = usual
 

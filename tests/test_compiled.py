@@ -1,9 +1,14 @@
 """Machine code that is kept between runs is that of the sources as they are."""
 
+import importlib
+import pkgutil
 from pathlib import Path
 
 import pytest
+from numba.core.registry import CPUDispatcher
 
+import data_synth
+import pipeline
 from data_synth import kernels as phantom
 from pipeline.compiled import kept_with
 from pipeline.evaluation import compiled as dissection
@@ -40,6 +45,24 @@ def test_what_compiled_code_takes_from_elsewhere_tells_it_apart_too():
     assert {"operators", *(f"../field/{name}" for name in ("potential", "kernels"))} <= {
         *dissection._SOURCES
     }
+
+
+@pytest.mark.parametrize("package", [pipeline, data_synth], ids=["pipeline", "phantom"])
+def test_what_calls_compiled_code_of_another_file_is_kept_with_that_file(package):
+    """The compiler by itself looks at a function's own file alone."""
+    calling = 0
+    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if "training" in found.name or found.name.endswith("__main__"):
+            continue
+        module = importlib.import_module(found.name)
+        for one in vars(module).values():
+            if not (isinstance(one, CPUDispatcher) and one.py_func.__module__ == found.name):
+                continue
+            called = [module.__dict__.get(name) for name in one.py_func.__code__.co_names]
+            if any(isinstance(to, CPUDispatcher) and to.__module__ != found.name for to in called):
+                calling += 1
+                assert "numba-" in one._cache.cache_path, (found.name, one.__name__)
+    assert calling > 10
 
 
 def test_a_changed_source_has_a_place_of_its_own(tmp_path, monkeypatch):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from pathlib import Path
 
+import numpy as np
+
+from pipeline.compiled import door
 from pipeline.geometry import Float, Integer, Mask
 from pipeline.surface.kernels import face_normal
 
 # Volumes below this share of a cell are rounding: what lies in one plane only touches.
 ROUNDING = 1e-10
+
+_compiled = door(Path(__file__).parent, ("crossings", "kernels"), nogil=True, cache=True)
 
 
 def crossing_triangles(vertices_mm: Float, triangles: Integer) -> Mask:
@@ -39,7 +43,7 @@ def crossing_triangles(vertices_mm: Float, triangles: Integer) -> Mask:
     return found
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _members(first, last, counts):  # type: ignore[no-untyped-def]
     """Triangles of each cell, in compressed rows: those whose box reaches into it."""
     starts = np.zeros(counts[0] * counts[1] * counts[2] + 1, np.int64)
@@ -60,7 +64,7 @@ def _members(first, last, counts):  # type: ignore[no-untyped-def]
     return starts, members
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _crossings(vertices, triangles, low, high, starts, members, tiny):  # type: ignore[no-untyped-def]
     """Test all pairs of each cell whose boxes overlap."""
     crossing = np.zeros(len(triangles), np.bool_)
@@ -88,7 +92,7 @@ def _crossings(vertices, triangles, low, high, starts, members, tiny):  # type: 
     return crossing
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _pierces(v, triangles, one, other, tiny):  # type: ignore[no-untyped-def]
     """Whether an edge of one triangle passes through another with which it shares no vertex."""
     a, b, c = triangles[other, 0], triangles[other, 1], triangles[other, 2]
@@ -106,7 +110,7 @@ def _pierces(v, triangles, one, other, tiny):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _passes(v, p, q, above, below, a, b, c, tiny):  # type: ignore[no-untyped-def]
     """Whether the edge from p to q, which are so high above a, b, c, passes through between."""
     if p in (a, b, c) or q in (a, b, c):
@@ -117,13 +121,13 @@ def _passes(v, p, q, above, below, a, b, c, tiny):  # type: ignore[no-untyped-de
     return min(first, second, third) > tiny or max(first, second, third) < -tiny
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _side(vertices, a, b, c, d):  # type: ignore[no-untyped-def]
     """Six times the signed volume of the tetrahedron a, b, c, d."""
     return _height(vertices, a, d, face_normal(vertices, a, b, c))
 
 
-@njit(nogil=True, cache=True)
+@_compiled
 def _height(v, a, d, normal):  # type: ignore[no-untyped-def]
     """How far d is above a, times the length of the normal."""
     x, y, z = normal
