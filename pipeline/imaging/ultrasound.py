@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
-from pipeline.imaging.limits import require_bounded
+from pipeline.imaging.metaimage import Fields, read_metaimage
 from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.sweep_poses import (
     TRACKER,
@@ -34,20 +32,6 @@ _FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
 # A sweep goes over centimetres, and no tracker sees a probe at its own place: what stays within
 # these is in metres.
 _STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
-# Bytes of one value, by its name in a MetaImage header; others are the library's to check.
-_VALUE_BYTES = {
-    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4,
-    "MET_FLOAT": 4, "MET_DOUBLE": 8,
-}  # fmt: skip
-_HEADER_LINE = re.compile(r"\s*(\w+)\s*[=:](.*)")
-_HEADER_ENDS = "ElementDataFile"
-_SEVERAL_FILES = re.compile(r"%|^LIST\b|\s\d+\s+\d+")
-# A file of another kind may have no lines at all.
-_LONGEST_LINE = 65536
-_PART_BYTES = 1 << 20
-_COPY = "copy it again from the tracking computer"
-
-Fields = dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +117,7 @@ def read_sweep(
         do not rise, or when no valid frame is left.
     """
     path = Path(path)
-    images, header = _read_image(path)
+    images, header = read_metaimage(path)
     images, turned = _as_scanned(path, images, header)
     frames = _frame_fields(path, header, len(images))
     frame = frame_of_poses(frames, pose_frame)
@@ -206,142 +190,6 @@ def odd_transforms(sweeps: Sequence[Sweep]) -> str:
 
 def _is_uncalibrated(sweep: Sweep) -> bool:
     return np.allclose(sweep.tracker_from_image, sweep.tracker_from_probe, rtol=0, atol=1e-9)
-
-
-def _read_image(path: Path) -> tuple[Any, Fields]:
-    """Pixels ``(n, rows, columns)`` and the header's custom fields."""
-    import SimpleITK as sitk
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a sweep is a .mha, or a .mhd with its raw file")
-    _require_all_bytes(path)
-    reader = sitk.ImageFileReader()
-    reader.SetImageIO("MetaImageIO")
-    reader.SetFileName(str(path))
-    try:
-        image = reader.Execute()
-    except RuntimeError as error:
-        raise InputError(
-            f"{path}: cannot be read as a MetaImage sequence ({_gist(error)}); {_COPY}"
-        ) from error
-    fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
-    return _grey_frames(path, image, sitk.GetArrayFromImage(image)), fields
-
-
-def _require_all_bytes(path: Path) -> None:
-    """Refuse a file whose pixels are missing, end before they should, or cannot be unpacked.
-
-    The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
-    """
-    header, start = _header_of(path)
-    values, each = _values(header), _VALUE_BYTES.get(header.get("ElementType", ""))
-    if values is None:
-        raise InputError(f"{path}: its header tells no DimSize in whole numbers; {_COPY}")
-    require_bounded(values, str(path))
-    whole = values * each if each else None
-    where = header.get(_HEADER_ENDS, "")
-    if _SEVERAL_FILES.search(where):
-        return
-    pixels = path if where.upper() == "LOCAL" else path.parent / where
-    if not pixels.is_file():
-        raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
-    packed = header.get("CompressedData", "False").upper() == "TRUE"
-    # Of a file of its own the library takes all there is.
-    if packed and pixels == path and _number(header.get("CompressedDataSize")) is None:
-        raise InputError(
-            f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
-            "it again, or uncompressed"
-        )
-    needed = _number(header.get("CompressedDataSize")) if packed else whole
-    found = pixels.stat().st_size - (start if pixels == path else 0)
-    if needed is not None and found < needed:
-        raise InputError(
-            f"{pixels}: ends too early: its pixels need {needed} bytes, it holds {found} of them; "
-            f"{_COPY}"
-        )
-    if packed:
-        _require_unpacked(pixels, start if pixels == path else 0, whole)
-
-
-def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
-    """Refuse compressed pixels that are damaged."""
-    # Of zlib or gzip, whichever it says.
-    unpacking, found = zlib.decompressobj(32 + zlib.MAX_WBITS), 0
-    try:
-        with path.open("rb") as file:
-            file.seek(start)
-            while not unpacking.eof and (part := file.read(_PART_BYTES)):
-                found += len(unpacking.decompress(part))
-    except zlib.error as error:
-        raise InputError(f"{path}: its compressed pixels are damaged ({error}); {_COPY}") from error
-    if needed is not None and found < needed:
-        raise InputError(
-            f"{path}: its pixels need {needed} bytes, {found} of them can be unpacked; {_COPY}"
-        )
-
-
-def _header_of(path: Path) -> tuple[Fields, int]:
-    """The fields of a header and the place where it ends."""
-    header: Fields = {}
-    with path.open("rb") as file:
-        while _HEADER_ENDS not in header:
-            line = file.readline(_LONGEST_LINE)
-            if not line:
-                raise InputError(
-                    f"{path}: is no whole MetaImage file: its header does not end with a line "
-                    f"{_HEADER_ENDS} within its {file.tell()} bytes; {_COPY}"
-                )
-            text = line.decode("utf-8", errors="replace")
-            field = _HEADER_LINE.match(text)
-            if field:
-                header[field[1]] = field[2].strip()
-            elif not header:
-                raise InputError(
-                    f"{path}: is no MetaImage file: it begins with {text[:20].strip()!r}, not "
-                    "with a line KEY = VALUE; name a .mha, or a .mhd with its raw file"
-                )
-        return header, file.tell()
-
-
-def _values(header: Fields) -> int | None:
-    """How many values all pixels have; None where the header does not say in whole numbers."""
-    words = [*header.get("DimSize", "?").split(), header.get("ElementNumberOfChannels", "1")]
-    return math.prod(_number(word) or 0 for word in words) or None
-
-
-def _number(word: str | None) -> int | None:
-    return int(word) if word and word.isdecimal() else None
-
-
-def _gist(error: RuntimeError) -> str:
-    """The last line of SimpleITK's report, which says what is wrong."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else "no reason given"
-
-
-def _grey_frames(path: Path, image: Any, values: Any) -> Any:
-    """Pixels ``(n, rows, columns)``; frames one pixel thick and colours that are all grey pass."""
-    size, components = image.GetSize(), image.GetNumberOfComponentsPerPixel()
-    if len(size) == 4 and size[2] == 1:
-        values = values[:, 0]
-    elif len(size) != 3:
-        raise InputError(
-            f"{path}: has {len(size)} dimensions {size}; a sweep is a stack of 2D frames "
-            "(columns, rows, frames); 3D probes are not supported"
-        )
-    if components == 3 and (values == values[..., :1]).all():
-        return values[..., 0]
-    if components != 1:
-        raise InputError(
-            f"{path}: has {components} values a pixel; export grey values, one a pixel"
-        )
-    spoilt = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
-    if len(spoilt):
-        raise InputError(
-            f"{path}: frame {spoilt[0]} has pixels that are no numbers ({len(spoilt)} of "
-            f"{len(values)} frames do); export grey values from 0 to 255"
-        )
-    return values
 
 
 def _as_scanned(path: Path, images: Any, header: Fields) -> tuple[Any, tuple[str, ...]]:
