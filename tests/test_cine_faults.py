@@ -23,8 +23,9 @@ from pipeline.imaging.faults import (
     require_finite,
     require_room_for_a_heart,
 )
-from pipeline.imaging.frames import Frame, choose_stack
+from pipeline.imaging.frames import Frame
 from pipeline.imaging.nifti import read_nifti_cine
+from pipeline.imaging.stack_choice import choose_stack
 from pipeline.study import open_study
 
 STEP_8_MM = np.diag([1.4, 1.4, 8.0, 1.0])

@@ -17,11 +17,10 @@ from pipeline.imaging.frames import (
     MIN_SLICES,
     Frame,
     by_slice,
-    choose_stack,
-    stacks_beside,
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.spacing import fill_gaps, regular_steps
+from pipeline.imaging.stack_choice import choose_stack, stacks_beside
 
 EVENLY = (
     "give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
