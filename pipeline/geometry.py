@@ -142,7 +142,9 @@ class Surface:
 
     def volume_mm3(self) -> float:
         """Enclosed volume by the divergence theorem; negative when normals point inwards."""
-        a, b, c = (self.vertices_mm[self.triangles[:, k]] for k in range(3))
+        # Far from the origin the parts would all but cancel.
+        near_mm = self.vertices_mm - self.vertices_mm.mean(axis=0)
+        a, b, c = (near_mm[self.triangles[:, k]] for k in range(3))
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
     def boundary_edges(self) -> Integer:

@@ -31,8 +31,8 @@ def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> No
         {
             "phases": cine.phases.tolist(),
             "rr_s": cine.rr_s,
-            "trigger_times_ms": stack.trigger_times_ms.tolist(),
-            "rr_ms": stack.rr_ms.tolist(),
+            "trigger_times_ms": _by_slice(stack, stack.trigger_times_ms.tolist()),
+            "rr_ms": _by_slice(stack, stack.rr_ms.tolist()),
             "timing_source": stack.timing_source,
             "left_out": list(stack.left_out),
             "interpolated_slices": list(cine.interpolated),
@@ -42,6 +42,14 @@ def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> No
             ],
         },
     )
+
+
+def _by_slice(stack: Stack, told: list[Any]) -> list[Any]:
+    """What is told of each slice; None of those that are drawn between others."""
+    if not stack.timed:
+        return told
+    known = dict(zip(stack.timed, told, strict=True))
+    return [known.get(number) for number in range(stack.cine.intensity.shape[1])]
 
 
 def _write_phases(path: Path, cine: Cine) -> None:

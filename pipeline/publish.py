@@ -316,7 +316,8 @@ def code_digest(module: str) -> str:
     """Digest of a module of the pipeline and of all that it imports from the pipeline.
 
     Imports inside functions count, those for types alone do not. Data files beside the imported
-    modules (network weights, page templates) count, since they decide the result as code does.
+    modules (network weights, page templates) count, since they decide the result as code does;
+    what compilers leave there does not, nor do the files that they are just writing.
     """
     digest = hashlib.sha256()
     paths = _import_closure(module)
@@ -324,7 +325,7 @@ def code_digest(module: str) -> str:
         path
         for folder in {path.parent for path in paths} - {PACKAGE}
         for path in folder.rglob("*")
-        if path.is_file() and path.suffix not in {".py", ".pyc", ".nbi", ".nbc"}
+        if "__pycache__" not in path.parts and path.suffix != ".py" and path.is_file()
     }
     for path in sorted(paths | data):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())

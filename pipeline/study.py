@@ -280,6 +280,13 @@ def _require_files(study: Study) -> None:
             "ecg/us.hea with its data, ecg/us.csv or ecg/us.dcm, or name it under ecg.us in "
             "study.yaml; to go on without the ultrasound write `us: null` there"
         )
+    names = [one.stem for one in study.us.sweeps] if study.us else []
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(
+            f"{study.folder}: {names.count(twice)} sweeps are called {twice}, by which frames are "
+            "told apart; rename or move one of the files, or name the one to be used under "
+            "us.sweeps in study.yaml"
+        )
     if study.us and study.us.initial_mr_from_tracker:
         start = np.array(study.us.initial_mr_from_tracker, dtype=float)
         require_rigid(start, f"{study.folder}/study.yaml: us.initial_mr_from_tracker")

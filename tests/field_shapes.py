@@ -27,6 +27,11 @@ def box_distance(points: Float, low: tuple[float, ...], high: tuple[float, ...])
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
 
 
+def flipped(surface: Surface) -> Surface:
+    """The same surface with its normals turned round."""
+    return Surface(surface.vertices_mm, np.ascontiguousarray(surface.triangles[:, ::-1]))
+
+
 def joined(*surfaces: Surface) -> Surface:
     """Several bodies as one surface."""
     starts = np.cumsum([0, *(len(one.vertices_mm) for one in surfaces[:-1])])

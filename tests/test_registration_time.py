@@ -9,12 +9,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sweep_files import good_fields, write
 
 from data_synth.ecg import EcgSettings, simulate_ecg
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.registration.time import detect_r_peaks, doubts_of_rate, median_rr_s, phases_at
-from pipeline.stages.register import _timing
+from pipeline.registration.time import (
+    detect_r_peaks,
+    doubts_of_rate,
+    in_known_beats,
+    median_rr_s,
+    phases_at,
+)
+from pipeline.stages.register import _sweeps, _timing
+from pipeline.study import UltrasoundFiles
 
 RATE_HZ = 500.0
 # How far a detected peak may lie from the R wave it stands for and still be the same event: under
@@ -261,6 +269,39 @@ def test_detected_peaks_give_the_phantoms_own_phases():
 
     # Each end of an interval is off by under 2 ms, of an interval of 0.7 s or more.
     assert np.abs((error + 0.5) % 1 - 0.5).max() < 0.002 / 0.7
+
+
+def test_times_between_beats_that_were_not_found_have_no_phase():
+    """RR intervals of 0.8 s, a compensatory pause of 1.2 s, and a lead that is off for 5 s."""
+    ecg = simulate_ecg(np.random.default_rng(8), 30.0, 0.8, RATE_HZ)
+    signal_mv = ecg.signal_mv.copy()
+    times_s = np.arange(len(signal_mv)) / RATE_HZ
+    signal_mv[(times_s > 12) & (times_s < 17)] = 0.0
+    found_s = detect_r_peaks(signal_mv, RATE_HZ)
+    asked_s = np.arange(2.0, 28.0, 0.05)
+    known = in_known_beats(asked_s, found_s)
+    assert known[(asked_s < 11) | (asked_s > 18.5)].all()
+    assert not known[(asked_s > 12) & (asked_s < 17)].any()
+    error = phases_at(asked_s, found_s) - phases_at(asked_s, ecg.r_times_s)
+    away = np.abs((error + 0.5) % 1 - 0.5)
+    assert away[known].max() < 0.01 < 0.3 < away[~known].max()
+
+    paused_s = np.array([1.0, 1.8, 2.4, 3.6, 4.4, 5.2])
+    assert in_known_beats(np.array([0.5, 1.0, 2.0, 3.0, 4.4, 5.9]), paused_s).all()
+
+
+def test_frames_without_a_beat_are_left_out_and_told(tmp_path):
+    path = write(tmp_path / "fan.mha", good_fields())
+    files = UltrasoundFiles(sweeps=(path,))
+    study = SimpleNamespace(us=files, ecg=SimpleNamespace(us=tmp_path / "us"))
+    # Frames at 3.0 to 3.2 s: two within the last beat before the ECG shows none for 3 s.
+    r_times_s = np.array([0.7, 1.5, 2.27, 3.08, 6.1, 6.9, 7.7])
+    (sweep,) = _sweeps(study, r_times_s)
+    assert sweep.numbers.tolist() == [0, 1]
+    assert sweep.images.shape[0] == len(sweep.times_s) == len(sweep.tracker_from_image) == 2
+    assert sweep.remarks[-1].startswith("3 of 5 frames, between 3.10 and 3.20 s, left out")
+    with pytest.raises(InputError, match=r"fan\.mha, beside .*us: 5 of 5 frames.* whole"):
+        _sweeps(study, r_times_s - 0.5)
 
 
 def test_median_rr_is_that_of_the_intervals():

@@ -378,6 +378,18 @@ def test_code_digest_follows_imports_but_not_those_of_other_stages() -> None:
     assert code_digest("pipeline.stages.ingest") != code_digest("pipeline.stages.surface")
 
 
+def test_what_compilers_leave_beside_the_code_does_not_count() -> None:
+    """Nor the files that they are writing, which other processes see come and go."""
+    before = code_digest.__wrapped__("pipeline.stages.bake")
+    beside = Path(runner.__file__).parent / "field" / "__pycache__" / "x.nbc.tmp.0123456789abcdef"
+    beside.parent.mkdir(exist_ok=True)
+    beside.touch()
+    try:
+        assert code_digest.__wrapped__("pipeline.stages.bake") == before
+    finally:
+        beside.unlink()
+
+
 def test_every_library_that_stages_import_counts_for_their_products() -> None:
     """But for those that read settings and words of the command line, which count themselves."""
     root = Path(runner.__file__).parent

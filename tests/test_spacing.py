@@ -14,7 +14,7 @@ from pipeline.imaging.cine import Cine
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.interpolation import isotropic_labels
 from pipeline.imaging.spacing import fill_gaps
-from pipeline.products import read_cine, write_cine
+from pipeline.products import read_cine, read_table, write_cine
 
 
 def without(*missing: int) -> Any:
@@ -67,6 +67,26 @@ def test_what_was_filled_in_is_written_and_read(tmp_path: Path) -> None:
     assert isinstance(again, Cine)
     assert again.interpolated == (1,)
     np.testing.assert_allclose(again.intensity, stack.cine.intensity)
+    told = read_table(tmp_path / "phases.json")
+    missing = [row is None for row in told["trigger_times_ms"]]
+    assert missing == [row is None for row in told["rr_ms"]] == [False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("by_ms", "words"), [(150, r"slice 3 lies 0\.\d+ of a cycle off"), (160, r"\(slice 3\)")]
+)
+def test_slices_are_counted_in_messages_as_the_stack_has_them(
+    tmp_path: Path, by_ms: float, words: str
+) -> None:
+    """The third of those that are there is number 3 where one between is missing."""
+
+    def late(data: Any, number: int, phase: int) -> bool:
+        data.TriggerTime += by_ms if number == 3 and phase else 0.0
+        return number != 1
+
+    write_dicom(tmp_path, late)
+    with pytest.raises(InputError, match=words):
+        read_dicom_study(tmp_path, fill=True)
 
 
 def test_every_third_slice_may_be_missing() -> None:

@@ -209,6 +209,17 @@ def test_a_sweep_in_a_folder_of_its_own_beside_others_is_not_passed_over(tmp_pat
         (folder / "us" / name).unlink()
 
 
+def test_two_sweeps_of_one_name_are_refused(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "us" / "sweep_001.mhd").write_text("ElementDataFile = sweep_001.raw\n")
+    with pytest.raises(InputError, match=r"2 sweeps are called sweep_001, .* rename or move"):
+        open_study(folder)
+    (folder / "us" / "sweep_001.mhd").unlink()
+    (folder / "study.yaml").write_text("us: {sweeps: [us/sweep_000.mha, us/sweep_000.mha]}\n")
+    with pytest.raises(InputError, match="2 sweeps are called sweep_000"):
+        open_study(folder)
+
+
 def test_files_that_headers_name_are_input_too(tmp_path: Path) -> None:
     """Or else a change of them would leave products standing that were made of others."""
     folder = study_folder(tmp_path)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from field_shapes import sphere
+from field_shapes import flipped, sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from surface_shapes import crossing_triangles as independent
@@ -21,7 +21,7 @@ from pipeline.meshes import write_vtp
 from pipeline.own_surfaces import bake_own_surfaces
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.level_set import LevelSet, smooth_level_set
-from pipeline.surface.mesh import adjacency, extract_surface, flipped, uncrossed
+from pipeline.surface.mesh import adjacency, extract_surface, uncrossed
 
 BESIDE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
 TWO = np.array([[0, 1, 2], [3, 4, 5]])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista
+from field_shapes import flipped
 from surface_shapes import crossing_triangles, ellipsoid, two_lobes, voxel_centres
 
 from pipeline.errors import InputError, StageError
@@ -18,7 +19,6 @@ from pipeline.surface.mesh import (
     adjacency,
     bad_triangles,
     extract_surface,
-    flipped,
     laplacian,
     largest_component,
     untangled,
@@ -88,9 +88,12 @@ def test_a_body_that_leaves_the_grid_is_refused():
         extract_surface(LevelSet(z.astype(np.float32), 1.5), 2.0)
 
 
-def test_flipping_turns_volume_round():
-    assert flipped(TETRAHEDRON).volume_mm3() == -TETRAHEDRON.volume_mm3()
+def test_volume_is_signed_and_the_same_wherever_a_body_lies():
     assert TETRAHEDRON.volume_mm3() == pytest.approx(1 / 6)
+    assert flipped(TETRAHEDRON).volume_mm3() == pytest.approx(-1 / 6)
+    # Places at a kilometre are told to 1e-10 mm, so volumes of a millimetre to some 1e-9 of it.
+    away = Surface(TETRAHEDRON.vertices_mm + np.array([1e6, -1e6, 1e6]), TETRAHEDRON.triangles)
+    assert away.volume_mm3() == pytest.approx(1 / 6, rel=1e-8)
 
 
 def test_largest_component_renumbers():

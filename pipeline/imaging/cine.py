@@ -71,6 +71,9 @@ class Stack:
     left_out: tuple[str, ...]
     """What is not part of the stack, such as long-axis views: a line a series, with the reason."""
 
+    timed: tuple[int, ...] = ()
+    """Which slices the times are of, where some are drawn between others; empty: of all."""
+
     remarks: tuple[str, ...] = ()
     """What the files leave open, and a person must know before the products are used."""
 
@@ -124,14 +127,15 @@ def stack_frames(
         raise InputError("; not taken: ".join([str(error), *lines])) from error
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
-    phases = common_phases(triggers, rr_ms, where)
+    phases = common_phases(triggers, rr_ms, where, numbers.tolist())
     mr_from_index = placement(slices[0][0], step_mm)
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
     doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen, where)
     patient = next((frame.patient for frame in chosen if frame.patient), "")
-    return Stack(cine, triggers, rr_ms, source, lines, doubts, patient)
+    timed = tuple(numbers.tolist()) if missing else ()
+    return Stack(cine, triggers, rr_ms, source, lines, timed, doubts, patient)
 
 
 def _unlike(frames: Sequence[Frame], name: str) -> str:
@@ -156,7 +160,9 @@ def _doubts_of_place(frames: Sequence[Frame]) -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
+def common_phases(
+    trigger_times_ms: Float, rr_ms: Float, where: str, numbers: Sequence[int] | None = None
+) -> Float:
     """One phase axis for all slices: trigger time over the slice's own RR interval.
 
     Parameters
@@ -165,13 +171,17 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
         ``(slice, phase)``.
     rr_ms
         ``(slice,)``.
+    numbers
+        ``(slice,)`` the slices' numbers in the stack, for messages; counted from 0 when left out.
 
     Raises
     ------
     InputError
         When an RR interval is implausible, a trigger time lies outside its heartbeat, all lie
-        within a small part of it, or a slice is over half a phase step away from the others.
+        within a small part of it, or of n phases those of a slice are over half an n-th of a cycle
+        away from the others'.
     """
+    numbers = range(len(rr_ms)) if numbers is None else numbers
     low_ms, high_ms = (1000 * limit for limit in PLAUSIBLE_RR_S)
     if not ((rr_ms > low_ms) & (rr_ms < high_ms)).all():
         worst = rr_ms[np.argmax(np.abs(np.log(np.maximum(rr_ms, 1e-6) / 900)))]
@@ -184,15 +194,16 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     if not np.isfinite(phases).all():
         number, phase = np.argwhere(~np.isfinite(phases))[0]
         raise InputError(
-            f"{where}: the trigger time of slice {number}, phase {phase}, is "
+            f"{where}: the trigger time of slice {numbers[number]}, phase {phase}, is "
             f"{trigger_times_ms[number, phase]:g}; give a number of milliseconds"
         )
-    if phases.min() < 0 or phases.max() >= 1:
-        number = int(np.argmax(np.abs(phases - 0.5).max(axis=1)))
+    outside = ((phases < 0) | (phases >= 1)).any(axis=1)
+    if outside.any():
+        number = int(outside.argmax())
         raise InputError(
             f"{where}: trigger times from {trigger_times_ms[number].min():g} to "
             f"{trigger_times_ms[number].max():g} ms do not fit in an RR interval of "
-            f"{rr_ms[number]:g} ms (slice {number}); correct them, or give cine.rr_ms "
+            f"{rr_ms[number]:g} ms (slice {numbers[number]}); correct them, or give cine.rr_ms "
             "in study.yaml"
         )
     common = phases.mean(axis=0)
@@ -211,8 +222,9 @@ def common_phases(trigger_times_ms: Float, rr_ms: Float, where: str) -> Float:
     away = np.abs(phases - common).max(axis=1)
     if away.max() > 0.5 / phases.shape[1]:
         raise InputError(
-            f"{where}: slice {int(away.argmax())} lies {away.max():.3f} of a cycle off the other "
-            f"slices' phases, at most half a step ({0.5 / phases.shape[1]:.3f}) can be used; "
+            f"{where}: slice {numbers[int(away.argmax())]} lies {away.max():.3f} of a cycle off "
+            f"the other slices' phases; of {phases.shape[1]} phases those that are at most "
+            f"{0.5 / phases.shape[1]:.3f} off can be used; "
             "all slices need the same phases; where times after the R peak are the same in all "
             "slices and RR intervals differ, cine.rr_ms in study.yaml puts all on one"
         )

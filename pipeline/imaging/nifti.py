@@ -147,7 +147,7 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         *_doubts_of_place(image),
         *_doubts_of_values(cine.intensity[0]),
     )
-    return Stack(cine, triggers, own_rr_ms, source, (), doubts)
+    return Stack(cine, triggers, own_rr_ms, source, (), remarks=doubts)
 
 
 def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis, ...]:

@@ -8,7 +8,7 @@ What repeats now and then is in order: recorders ask faster than scanners and tr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -70,15 +70,7 @@ def without_stuck(sweep: Sweep) -> Sweep:
         remarks.append(_told_left_out(kept, frozen, leaps))
     if not kept.any():
         raise InputError(f"{sweep.name}: {remarks[-1]}; record the sweep again")
-    return replace(
-        sweep,
-        images=sweep.images[kept],
-        times_s=sweep.times_s[kept],
-        tracker_from_image=sweep.tracker_from_image[kept],
-        tracker_from_probe=sweep.tracker_from_probe[kept],
-        numbers=sweep.numbers[kept],
-        remarks=(*sweep.remarks, *remarks),
-    )
+    return sweep.only(kept, *remarks)
 
 
 def _repeats(answers: Float | Float32) -> Mask:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Float32, Integer
+from pipeline.geometry import Float, Float32, Integer, Mask
 from pipeline.imaging.metaimage import Fields, read_metaimage
 from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.sweep_poses import (
@@ -64,6 +64,18 @@ class Sweep:
 
     remarks: tuple[str, ...] = ()
     """What a person should know of how the file was read."""
+
+    def only(self, kept: Mask, *remarks: str) -> Sweep:
+        """The frames of a mask ``(n,)``, and more to be told of them."""
+        return replace(
+            self,
+            images=self.images[kept],
+            times_s=self.times_s[kept],
+            tracker_from_image=self.tracker_from_image[kept],
+            tracker_from_probe=self.tracker_from_probe[kept],
+            numbers=self.numbers[kept],
+            remarks=(*self.remarks, *remarks),
+        )
 
 
 def read_sweeps(files: UltrasoundFiles) -> list[Sweep]:

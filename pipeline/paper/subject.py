@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.field.files import read_metadata, require_manifest
+from pipeline.field.files import read_metadata
 from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FixturePart
 from pipeline.field.reader import ForceField
@@ -70,7 +70,6 @@ def open_subject(products: Path, study: Path | None = None) -> Subject:
             f"--products {products}: holds neither bake/field.zarr nor zarr.json; give a "
             "patient's products folder (make demo writes demo/products-1/patient-0001) or a field"
         )
-    require_manifest(path)
     field = ForceField.open(path)
     if field.rr_s is None:
         raise InputError(

@@ -207,7 +207,7 @@ def to_cycle(phases: npt.ArrayLike, rr_s: npt.ArrayLike, cycle_rr_s: float) -> F
     Raises
     ------
     InputError
-        When a phase lies outside [0, 1) or an interval is not of a heart.
+        When a phase lies outside [0, 1), or an interval is not positive and finite.
 
     >>> to_cycle([0.0, 0.4], 0.8, 0.8)
     array([0. , 0.4])
@@ -219,8 +219,11 @@ def to_cycle(phases: npt.ArrayLike, rr_s: npt.ArrayLike, cycle_rr_s: float) -> F
     )
     if not ((own >= 0) & (own < 1)).all():
         raise InputError("phases must lie in [0, 1)")
-    if not ((lengths > 0) & np.isfinite(lengths)).all() or not cycle_rr_s > 0:
-        raise InputError(f"RR intervals must be positive, got {np.min(lengths)} and {cycle_rr_s} s")
+    if not ((lengths > 0) & np.isfinite(lengths)).all() or not 0 < cycle_rr_s < np.inf:
+        raise InputError(
+            f"RR intervals must be positive and finite, got {np.min(lengths)} to "
+            f"{np.max(lengths)} and {cycle_rr_s} s"
+        )
     out = np.empty(own.size)
     ticks.to_cycle_all(own.ravel(), lengths.ravel(), float(cycle_rr_s), out)
     return out.reshape(own.shape)

@@ -10,13 +10,16 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Mask
 from pipeline.registration.clock import to_cycle
 from pipeline.registration.rpeaks import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, find_beats, is_fit_rate
 
 OTHER_RATE = 1.8
 """Times by which one heart may beat faster or slower in another examination. A record told at twice
 its sampling rate, or half, is beyond."""
+LONGEST_BEAT = 1.75
+"""Times the median RR interval: a longer one may hold beats that were not found. The pause after an
+extrasystole is shorter, for it and the short interval before it make two."""
 _SHORTEST_RECORD_S = 3.0
 # Three years, which no recording lasts: such times are counted from 1970.
 _SINCE_1970_S = 1e8
@@ -106,6 +109,16 @@ def phases_at(times_s: Float, r_times_s: Float, cycle_rr_s: float | None = None)
     # Rounding may lift a time just before an R peak to exactly 1.
     share = np.asarray(np.where(phase < 1, phase, 0.0))
     return share if cycle_rr_s is None else to_cycle(share, own_s, cycle_rr_s)
+
+
+def in_known_beats(times_s: Float, r_times_s: Float) -> Mask:
+    """Whether each time ``(n,)`` lies in an RR interval that can be one beat: others have no phase.
+
+    Before the first R peak and after the last, where the median stands in, times do.
+    """
+    longest_s = LONGEST_BEAT * median_rr_s(r_times_s)
+    too_long = np.concatenate([[False], np.diff(r_times_s) > longest_s, [False]])
+    return np.asarray(~too_long[np.searchsorted(r_times_s, times_s, side="right")])
 
 
 def _other_clock(times_s: Float, start_s: float, end_s: float) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline import __version__
 from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
+from pipeline.field.certificate import allowed_errors
 from pipeline.field.fixture import DEFAULT_FIXTURES, Fixture
 from pipeline.geometry import MovingSurface
 from pipeline.job import Job
@@ -49,6 +50,7 @@ def run(job: Job) -> dict[str, Any]:
     )
     return {
         "accuracy": certificate,
+        "allowed": allowed_errors(job.settings.bake.bounds, job.settings.bake.spacing_mm),
         "example": _example(fixtures, surfaces, job.settings.bake.margin_mm),
         "left_out": left_out,
     }

@@ -23,7 +23,7 @@ from pipeline.products import (
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import Registration, register, require_frames
-from pipeline.registration.time import detect_r_peaks, median_rr_s, phases_at
+from pipeline.registration.time import detect_r_peaks, in_known_beats, median_rr_s, phases_at
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on how a study's folder is understood.
@@ -35,9 +35,9 @@ def run(job: Job) -> dict[str, Any]:
     if job.study.us is None:
         raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
     start = _start(job)
-    sweeps = read_sweeps(job.study.us)
     ecg = _ecg(job.study)
     r_times_s = _r_times_s(job.study, ecg)
+    sweeps = _sweeps(job.study, r_times_s)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle["rr_s"])
@@ -75,8 +75,9 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
     """
     if study.us is None:
         return
-    sweeps = read_sweeps(study.us)
-    timing = _timing(study, sweeps, _r_times_s(study, _ecg(study)), None)
+    r_times_s = _r_times_s(study, _ecg(study))
+    sweeps = _sweeps(study, r_times_s)
+    timing = _timing(study, sweeps, r_times_s, None)
     if settings.on_failure == "stop":
         require_frames(sweeps, timing.phases(), settings)
 
@@ -109,6 +110,26 @@ def _registered(
         if malformed or settings.on_failure == "stop":
             raise said from error.__cause__
         raise Skipped(f"{said}; the field is in the frame of the MR") from error
+
+
+def _sweeps(study: Study, r_times_s: Float) -> list[Sweep]:
+    """The sweeps, without frames that were taken while the ECG shows no beat."""
+    assert study.us is not None, "only a study with ultrasound is registered"
+    sweeps = []
+    for path, sweep in zip(study.us.sweeps, read_sweeps(study.us), strict=True):
+        known = in_known_beats(sweep.times_s, r_times_s)
+        told = [] if known.all() else [_told_of_pause(sweep.times_s[~known], len(known))]
+        if not known.any():
+            raise InputError(f"{path}, beside {study.ecg.us}: {told[0]}; give its own ECG, whole")
+        sweeps.append(sweep.only(known, *told))
+    return sweeps
+
+
+def _told_of_pause(times_s: Float, frames: int) -> str:
+    return (
+        f"{len(times_s)} of {frames} frames, between {times_s[0]:.2f} and {times_s[-1]:.2f} s, "
+        "left out: the ECG shows no beat there for longer than one lasts"
+    )
 
 
 def _timing(

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.field.certificate import allowed_errors
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
@@ -280,7 +279,7 @@ def _field(job: Job, shown: Moments) -> Section:
             Table(head, rows),
             *certificate.tables(
                 job.figures("bake")["accuracy"],
-                allowed_errors(job.settings.bake.bounds, job.settings.bake.spacing_mm),
+                job.figures("bake")["allowed"],
             ),
         ],
     )

@@ -38,8 +38,6 @@ def extract_surface(level: LevelSet, edge_mm: float) -> Surface:
         When the level set has no zero level, or its surface is not closed.
     """
     surface = largest_component(_march(level, edge_mm / EDGE_PER_STEP))
-    if surface.volume_mm3() < 0:
-        surface = flipped(surface)
     if len(surface.boundary_edges()):
         raise StageError(
             f"marching cubes left {len(surface.boundary_edges())} open edges on a surface of "
@@ -59,12 +57,9 @@ def _march(level: LevelSet, step_mm: float) -> Surface:
     if not (field.min() < 0 < field.max()):
         raise StageError("a structure is too small for a surface: its smooth distance has no zero")
     vertices, triangles, _, _ = marching_cubes(field, 0.0, spacing=(step_mm,) * 3)
-    return Surface(vertices[:, ::-1].astype(np.float64), triangles.astype(np.int64))
-
-
-def flipped(surface: Surface) -> Surface:
-    """The same surface with its normals turned round."""
-    return Surface(surface.vertices_mm, np.ascontiguousarray(surface.triangles[:, ::-1]))
+    # Axes in the reverse order turn every triangle round.
+    outward = np.ascontiguousarray(triangles[:, ::-1], dtype=np.int64)
+    return Surface(vertices[:, ::-1].astype(np.float64), outward)
 
 
 def largest_component(surface: Surface) -> Surface:
