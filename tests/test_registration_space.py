@@ -19,6 +19,7 @@ from ellipsoid_heart import (
     start_off,
     target_error_mm,
 )
+from sweep_files import good_fields, write
 
 from data_synth.ecg import simulate_ecg
 from data_synth.population import draw_heart
@@ -34,6 +35,7 @@ from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
 from pipeline.registration.uncertainty import motion_between
 from pipeline.stages import register as stage
+from pipeline.study import UltrasoundFiles
 
 # A tool that is off by this much misses: the figure that the field's users are promised.
 PROMISED_MM = 1.5
@@ -296,15 +298,14 @@ class TestRefusals:
         (doubt,) = stage._registered(job, [], timing_of(recording, 1.6), {}, None)
         assert "75 times a minute in the ultrasound's ECG and 38 times in the MR" in doubt
 
-    def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(self, monkeypatch):
-        sweep = SimpleNamespace(images=np.zeros((4, 2, 2), np.float32))
-        monkeypatch.setattr(stage, "read_sweeps", lambda _: [sweep])
+    def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(
+        self, monkeypatch, tmp_path
+    ):
         monkeypatch.setattr(stage, "_ecg", lambda _: None)
-        monkeypatch.setattr(stage, "_r_times_s", lambda *_: None)
-        timing = SimpleNamespace(phases=lambda: [np.zeros(4)])
-        monkeypatch.setattr(stage, "_timing", lambda *_: timing)
-        study = SimpleNamespace(us=SimpleNamespace(sweeps=("a",)))
-        with pytest.raises(UnregistrableError, match=r"hold 4 frames.*10 or more \(register"):
+        monkeypatch.setattr(stage, "_r_times_s", lambda *_: np.arange(1.0, 6.0, 0.8))
+        us = UltrasoundFiles(sweeps=(write(tmp_path / "fan.mha", good_fields()),))
+        study = SimpleNamespace(us=us, ecg=SimpleNamespace(us=tmp_path / "us"))
+        with pytest.raises(UnregistrableError, match=r"hold 5 frames.*10 or more \(register"):
             stage.require_usable(study, RegisterSettings())
         stage.require_usable(study, RegisterSettings(on_failure="mr_frame"))
 
