@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +34,13 @@ def guarded(command: Callable[[], Any]) -> int:
         if error.errno not in NO_SPACE or error.filename is not None:
             raise
         silence(sys.stdout)
-        say(f"error: what is printed, or a temporary file, cannot be written ({error.strerror})")
+        places = f"{tempfile.gettempdir()} (TMPDIR)"
+        if kept := os.environ.get("NUMBA_CACHE_DIR"):
+            places += f", {kept} (NUMBA_CACHE_DIR)"
+        say(
+            "error: what is printed, a temporary file or compiled code cannot be written "
+            f"({error.strerror}); free some space, also in {places}"
+        )
         return 2
     except MemoryError as error:
         say(f"error: memory is not enough ({error}); {MORE_MEMORY}")

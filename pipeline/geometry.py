@@ -43,6 +43,10 @@ def corners_apart_mm(mr_from_one: Float, mr_from_other: Float, counts: Sequence[
     return float(np.linalg.norm(corners @ moved[:, :3].T + moved[:, 3], axis=1).max())
 
 
+_ROUNDED = 0.02
+"""Axes of numbers with two decimals miss length 1 and right angles by less."""
+
+
 def require_rigid(transform: Float, where: str) -> None:
     """Raise InputError unless ``transform`` is a rotation and a shift (finite, 1e-3 in angle)."""
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
@@ -60,6 +64,8 @@ def require_rigid(transform: Float, where: str) -> None:
                 "; it looks transposed: its shift stands in the last row, and belongs in the last "
                 "column, above the 1"
             )
+        elif off < _ROUNDED:
+            hint = "; it looks rounded: write its numbers with five decimals or more"
         raise InputError(
             f"{where}: is not a rotation and a shift (its axes miss length 1 and right angles by "
             f"{off:.2g}, {_RIGID:g} is allowed), got\n{transform}{hint}"

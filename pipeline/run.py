@@ -178,6 +178,9 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         for word, text in remarks(run.stages):
             error.add_note(f"{word}: {text}")
         raise
+    except OSError as error:
+        _fail(run, stage, error, time.perf_counter() - clock)
+        raise
     seconds = time.perf_counter() - clock
     measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}
     run.stages[stage.name] = _entry(run, stage.name, "done", figures, key, measured)
@@ -207,7 +210,7 @@ def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
         raise
 
 
-def _fail(run: _Run, stage: Stage, error: BeatfieldError, seconds: float) -> None:
+def _fail(run: _Run, stage: Stage, error: Exception, seconds: float) -> None:
     """Record that a stage failed, and say what of earlier runs is no longer to be used."""
     run.stages[stage.name] = {"status": "failed", "cause": str(error)}
     run.watcher.ended(stage.name, "failed", seconds)

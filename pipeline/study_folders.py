@@ -131,6 +131,6 @@ def require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
 def _record(stem: Path) -> Path | None:
     if stem.with_suffix(".hea").exists():
         return stem
-    return next(
-        (stem.with_suffix(end) for end in (".csv", ".dcm") if stem.with_suffix(end).exists()), None
-    )
+    # Some systems write endings in capitals.
+    ends = (".csv", ".CSV", ".dcm", ".DCM")
+    return next((stem.with_suffix(end) for end in ends if stem.with_suffix(end).exists()), None)

@@ -71,6 +71,16 @@ def test_tied_trigger_times_give_way_to_the_next_best_clock(
     assert name in stack.timing_source
 
 
+def test_the_heart_rate_goes_before_the_interval_that_was_asked_for(tmp_path: Path) -> None:
+    """Of an Enhanced object both stand at the top; 60,000 / 75 is `RR_MS`."""
+    data = enhanced_object(ALL_FRAMES)
+    for own in data.PerFrameFunctionalGroupsSequence:
+        del own.CardiacSynchronizationSequence[0].RRIntervalTimeNominal
+    data.HeartRate, data.CardiacRRIntervalSpecified = "75", 1000.0
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
 def test_enhanced_frames_without_description_are_refused(tmp_path: Path) -> None:
     data = enhanced_object(ALL_FRAMES)
     del data.PerFrameFunctionalGroupsSequence[-1]

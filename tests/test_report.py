@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,9 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from PIL import Image
 
+from pipeline.errors import StageError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.labels import LABELS
-from pipeline.report import certificate, curves, heart, pictures, slices
+from pipeline.report import animation, certificate, curves, heart, pictures, slices
 from pipeline.report.animation import HEAD, ROOM, TOWARDS_VIEWER, _webp, even_in_time, framing
 from pipeline.report.colours import STYLES
 from pipeline.report.moments import MARGIN_PIXELS, Moments
@@ -275,6 +278,24 @@ def test_a_sure_segmentation_has_no_table_of_doubts() -> None:
     section = heart.segmentation(moments(3), np.full((2, 3), 0.97), 0.8)
     assert section.tables == []
     assert "Lowest confidence: 0.97" in section.text
+
+
+@pytest.mark.parametrize("where", ["before", "after"])
+def test_an_animation_without_room_for_its_files_fails(
+    monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """A page without it would stand as finished."""
+    ball = MovingSurface(np.zeros((2, 3, 3)), np.array([[0, 1, 2]]), np.array([0, 0.5]))
+
+    def full(path: Path, surfaces: object) -> None:
+        if where == "before":
+            raise OSError(28, "No space left on device")
+
+    ended = subprocess.CompletedProcess([], animation.NO_ROOM)
+    monkeypatch.setattr(animation, "_hand_over", full)
+    monkeypatch.setattr(animation.subprocess, "run", lambda *_, **__: ended)
+    with pytest.raises(StageError, match=r"temporary files .* TMPDIR"):
+        animation.beating_surfaces({"epicardium": ball}, 0.8)
 
 
 def test_what_cannot_be_shown_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -185,6 +185,19 @@ def test_a_failure_repeats_what_finished_stages_noticed(
     assert caught.value.__notes__ == ["input: a is odd"]
 
 
+def test_a_stage_without_room_for_temporary_files_has_failed(kitchen: Kitchen) -> None:
+    """The system's error goes on to the command line; the record does not say running."""
+
+    def fail(job: Job) -> dict[str, Any]:
+        raise OSError(5, "Input/output error")
+
+    kitchen.bodies["b"] = fail
+    with pytest.raises(OSError, match="Input/output"):
+        kitchen.run()
+    record = kitchen.record()
+    assert record["status"] == record["stages"]["b"]["status"] == "failed"
+
+
 def test_a_failing_stage_publishes_nothing_and_keeps_what_was_finished(kitchen: Kitchen) -> None:
     def fail(job: Job) -> dict[str, Any]:
         (job.folder / "text").write_text("half")

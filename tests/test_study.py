@@ -209,6 +209,15 @@ def test_a_sweep_in_a_folder_of_its_own_beside_others_is_not_passed_over(tmp_pat
         (folder / "us" / name).unlink()
 
 
+@pytest.mark.parametrize("name", ["us.csv", "us.CSV", "us.dcm", "us.DCM"])
+def test_a_record_is_found_whatever_letters_its_ending_has(tmp_path: Path, name: str) -> None:
+    folder = study_folder(tmp_path)
+    for ending in (".hea", ".dat"):
+        (folder / "ecg" / f"us{ending}").unlink()
+    (folder / "ecg" / name).touch()
+    assert open_study(folder).ecg.us == folder / "ecg" / name
+
+
 def test_two_sweeps_of_one_name_are_refused(tmp_path: Path) -> None:
     folder = study_folder(tmp_path)
     (folder / "us" / "sweep_001.mhd").write_text("ElementDataFile = sweep_001.raw\n")

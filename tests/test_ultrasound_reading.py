@@ -229,6 +229,12 @@ def test_probe_pose_in_columns_is_told(tmp_path):
         read_sweep(write(tmp_path / "s.mha", fields))
 
 
+def test_probe_pose_of_few_decimals_is_told(tmp_path):
+    fields = good_fields() | {"Seq_Frame0002_ProbeToTrackerTransform": text(rigid(2).round(2))}
+    with pytest.raises(InputError, match=r"frame 2: ProbeToTracker(.*\n)*.*five decimals"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
 @pytest.mark.parametrize("fault", ["metres", "flat", "last row"])
 def test_calibration_that_is_no_plane_in_mm_is_refused(tmp_path, fault):
     matrix = calibration(0.0005 if fault == "metres" else 0.5)

@@ -238,7 +238,8 @@ def _sofa(field: _Stored, folder: Path) -> None:
             continue
         for index in range(len(field.times)):
             name = f"{_name(part)}_{index:03d}.raw"
-            field.at(part, index).astype("<f8").tofile(folder / name)
+            # What `tofile` raises on a full disk says nothing of why.
+            (folder / name).write_bytes(field.at(part, index).astype("<f8").tobytes())
             rows.append(
                 f"  <DistanceGridForceField filename={quoteattr(name)} "
                 f'nx="{nx}" ny="{ny}" nz="{nz}" box="{low} {high}"/>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -311,13 +312,9 @@ def _given(item: Any, name: str) -> bool:
 
 
 def _rr_ms(timing: Any, dataset: Any) -> float | None:
-    for item, name in (
-        (timing, "NominalInterval"),
-        (timing, "RRIntervalTimeNominal"),
-        (timing, "HeartRate"),
-        (dataset, "CardiacRRIntervalSpecified"),
-        (dataset, "HeartRate"),
-    ):
+    """By the attribute that tells it best, of the frame or, behind that, of its whole object."""
+    names = ("NominalInterval", "RRIntervalTimeNominal", "HeartRate", "CardiacRRIntervalSpecified")
+    for name, item in itertools.product(names, (timing, dataset)):
         if _given(item, name) and float(item.get(name)) > 0:
             value = float(item.get(name))
             return 60000 / value if name == "HeartRate" else value

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.report.colours import SOLID_COLOURS
 
@@ -26,24 +27,44 @@ TIME_LIMIT_S = 300
 # Seen from the patient's front left (LPS: left is +x, anterior is -y), head up.
 TOWARDS_VIEWER = np.array([0.5, -1.0, 0.25])
 HEAD = np.array([0.0, 0.0, 1.0])
+NO_ROOM = 28
+"""The drawing process ends with this where its pictures cannot be written."""
 ROOM = 1.06
 """The picture is this much larger than what moves in it."""
 
 
 def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> bytes | None:
-    """Animated WebP of one heartbeat, or None where this machine cannot draw in 3D."""
+    """Animated WebP of one heartbeat, or None where this machine cannot draw in 3D.
+
+    Raises
+    ------
+    StageError
+        When there is no room for temporary files.
+    """
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        _hand_over(work / "surfaces.npz", surfaces)
+        try:
+            _hand_over(work / "surfaces.npz", surfaces)
+        except OSError as error:
+            raise _no_room() from error
         command = [sys.executable, "-m", "pipeline.report.animation", str(work)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=TIME_LIMIT_S, check=False)
         except subprocess.TimeoutExpired:
             return None
+        if done.returncode == NO_ROOM:
+            raise _no_room()
         if done.returncode != 0:
             return None
         frames = np.load(work / "frames.npy")
     return _webp(frames, rr_s)
+
+
+def _no_room() -> StageError:
+    return StageError(
+        f"{tempfile.gettempdir()}: temporary files of the animation cannot be written; free some "
+        "space there, or name a place that has some in TMPDIR"
+    )
 
 
 def _hand_over(path: Path, surfaces: Mapping[str, MovingSurface]) -> None:
@@ -144,7 +165,10 @@ def _draw(work: Path) -> None:
             mesh.points = arrays[f"{name}.vertices"][number]
         plotter.render()
         frames.append(plotter.screenshot(return_img=True))
-    np.save(work / "frames.npy", np.stack(frames))
+    try:
+        np.save(work / "frames.npy", np.stack(frames))
+    except OSError:
+        sys.exit(NO_ROOM)
 
 
 if __name__ == "__main__":
