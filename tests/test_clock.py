@@ -305,6 +305,26 @@ def test_the_clock_loads_nothing_heavier_than_numpy_and_numba():
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
+@pytest.mark.parametrize("rr_s", [0.364, 0.42, 0.7, 0.816])
+@pytest.mark.parametrize("cycle_s", [0.75, 1.2])
+def test_a_paced_heart_on_the_grid_of_the_loop_never_makes_the_phase_jump(rr_s, cycle_s):
+    """Where R times and questions are whole milliseconds, some fall a rounding before an R peak."""
+    clock, told, before = PhaseClock(cycle_s), 0, None
+    fastest = 0.0
+    for n in range(6000):
+        while told * rr_s + 0.132 <= n / 1000:
+            clock.beat(told * rr_s)
+            told += 1
+        now = clock.at(n / 1000)
+        if before and before.valid:
+            step = now.phase - before.phase
+            fastest = max(fastest, step - np.floor(step + 0.5))
+            assert step - np.floor(step + 0.5) >= 0
+        before = now
+    # Of a beat's parts the quickest is diastole, told within what atrial contraction leaves of it.
+    assert 0 < fastest < 0.02
+
+
 def test_a_beat_that_is_taken_back_leaves_nothing_but_what_was_rendered():
     """P waves told 0.17 s ahead of every beat: the clock knows what one without them knows."""
     misled, other = PhaseClock(0.8), PhaseClock(0.8)

@@ -16,6 +16,7 @@ from pipeline.exact import points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
+from pipeline.field.motion import Motion
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface, Surface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field
@@ -135,6 +136,20 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     assert off_mm.max() < 0.1
     assert np.percentile(off_mm, 99) < 0.06
     assert said["drift_max_mm"] == pytest.approx(off_mm.max(), rel=0.5)
+
+
+@pytest.mark.parametrize("end", [1.0, 0.9, 0.8, 0.7])
+def test_where_no_phase_is_for_long_errors_of_the_phases_do_not_grow(end):
+    """Independent errors of the places are multiplied by the root of the summed squared weights:
+    by 20 where a spline is left alone for a third of the beat."""
+    phases = np.arange(25) / 25 * end
+    still = MovingSurface(np.ones((25, 3, 3)), np.array([[0, 1, 2]]), phases)
+    motion = Motion.of(still)
+    weights = np.array([motion.weights(phase) for phase in np.linspace(0, 1, 400, endpoint=False)])
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
+    assert np.linalg.norm(weights, axis=1).max() < 1.4
+    known = np.array([motion.weights(phase) for phase in phases])
+    np.testing.assert_allclose(known, np.eye(25), atol=1e-12)
 
 
 def test_what_rests_beside_what_moves_is_measured_anew(tmp_path):

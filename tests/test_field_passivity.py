@@ -103,7 +103,9 @@ def test_no_swing_gives_more_than_the_tank_held(swing_mm, rate_hz, level_mj):
     assert given_mj.max() <= level_mj + 2 * step_mj
 
 
-@pytest.mark.parametrize(("level", "capacity"), [(-1, 5), (6, 5), (float("nan"), 5)])
+@pytest.mark.parametrize(
+    ("level", "capacity"), [(-1, 5), (6, 5), (float("nan"), 5), (5, float("inf"))]
+)
 def test_impossible_tanks_are_refused(level, capacity):
     with pytest.raises(InputError, match="needs 0 <= level_mj <= capacity_mj"):
         EnergyTank(level, capacity)

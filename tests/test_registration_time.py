@@ -290,6 +290,19 @@ def test_times_between_beats_that_were_not_found_have_no_phase():
     assert in_known_beats(np.array([0.5, 1.0, 2.0, 3.0, 4.4, 5.9]), paused_s).all()
 
 
+@pytest.mark.parametrize("beats", [2, 3, 40, 41])
+def test_bigeminy_and_another_rate_have_phases_throughout(beats):
+    for rr_s in (np.resize([0.5, 1.1], beats), np.repeat([0.4, 0.75], [2 * beats, beats])):
+        r_times_s = np.cumsum(np.concatenate([[0.5], rr_s]))
+        assert in_known_beats(np.arange(0.0, r_times_s[-1] + 0.4, 0.04), r_times_s).all()
+    missed_s = np.delete(np.cumsum(np.resize([0.5, 1.1], 41)), [20, 21])
+    asked_s = np.arange(missed_s[0], missed_s[-1], 0.04)
+    widest = np.diff(missed_s).argmax()
+    inside = (asked_s > missed_s[widest]) & (asked_s < missed_s[widest + 1])
+    assert not in_known_beats(asked_s[inside], missed_s).any()
+    assert in_known_beats(asked_s[~inside], missed_s).all()
+
+
 def test_frames_without_a_beat_are_left_out_and_told(tmp_path):
     path = write(tmp_path / "fan.mha", good_fields())
     files = UltrasoundFiles(sweeps=(path,))

@@ -112,3 +112,25 @@ def test_planes_unevenly_spaced_give_the_body_that_evenly_spaced_ones_give() -> 
     # Outlines are found to a quarter of a pixel; a voxel on the outline may fall either way.
     outline = np.pi * 2 * (12 + 0.3 * 25) / 1.5 * 50 / 1.5
     assert (whole != parts).sum() < outline / 4
+
+
+@pytest.mark.parametrize(("aside_mm", "fits"), [(0.02, True), (0.5, False)])
+def test_positions_of_few_decimals_are_straightened_and_a_leaning_stack_is_refused(
+    tmp_path: Path, aside_mm: float, fits: bool
+) -> None:
+    def lean(data: Any, number: int, phase: int) -> bool:
+        across = np.array(data.ImageOrientationPatient[:3], dtype=float)
+        place_mm = np.array(data.ImagePositionPatient, dtype=float)
+        data.ImagePositionPatient = (place_mm + number * aside_mm * across).tolist()
+        return True
+
+    write_dicom(tmp_path / "cine", lean)
+    if not fits:
+        with pytest.raises(InputError, match=r"shifted sideways.* by 1\.50 mm"):
+            read_dicom_study(tmp_path / "cine")
+        return
+    stack = read_dicom_study(tmp_path / "cine")[0]
+    write_cine(tmp_path, stack)
+    np.testing.assert_allclose(
+        read_cine(tmp_path).mr_from_index, stack.cine.mr_from_index, atol=1e-4
+    )

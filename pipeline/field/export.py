@@ -6,6 +6,7 @@ or of docs/field.md knows what to do with them.
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -153,6 +154,7 @@ def _nifti(field: _Stored, folder: Path) -> None:
 def _vti(field: _Stored, folder: Path) -> None:
     """One ``.vti`` a phase with all arrays, and a ``.pvd`` that names them with their times."""
     import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
     try:
         str(folder).encode()
@@ -168,7 +170,12 @@ def _vti(field: _Stored, folder: Path) -> None:
         for part in field.arrays:
             image.point_data[_name(part)] = field.at(part, index).ravel()
         name = f"phase_{index:03d}.vti"
-        image.save(folder / name)
+        writer = vtkXMLImageDataWriter()
+        writer.SetInputData(image)
+        writer.SetFileName(str(folder / name))
+        if writer.Write() != 1:
+            # VTK says no more than that; places that may not be written were refused before.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder / name))
         rows.append(f'    <DataSet timestep="{time!r}" file="{name}"/>')
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *rows]
     (folder / "field.pvd").write_text("\n".join([*lines, "  </Collection>", "</VTKFile>", ""]))

@@ -9,6 +9,10 @@ import numpy as np
 
 from pipeline.geometry import Float, Integer, Surface
 
+GAP = 1.5
+"""A step longer than so many mean ones is a gap in the phases: no spline knows the way through it.
+"""
+
 
 class BeatingSurface(Protocol):
     """Anything that gives a closed surface for every stored phase."""
@@ -52,17 +56,33 @@ class Motion:
         )
         if not same or count < 3:
             return None
-        phases = np.append(moving.phases, moving.phases[0] + 1)
         order = 5 if count >= 8 else 3
         # SciPy solves one right-hand side after another: a spline for each phase is far fewer than
         # one for each coordinate.
-        one_by_one = np.eye(count)[[*range(count), 0]]
+        phases, one_by_one = _led_across_gaps(np.append(moving.phases, moving.phases[0] + 1))
         weights = make_interp_spline(phases, one_by_one, k=order, bc_type="periodic")
         return cls(weights, np.stack([one.vertices_mm for one in each]), first.triangles)
 
     def at(self, phase: float) -> Surface:
         """The surface at any phase."""
         return Surface(np.tensordot(self.weights(phase), self.places_mm, 1), self.triangles)
+
+
+def _led_across_gaps(phases: Float) -> tuple[Float, Float]:
+    """Phases ``(n,)``, the first again a beat later, and what each stored phase's places count for
+    there, ``(n, phase)``: more of them, on the straight line, where no phase is for long.
+
+    A spline through places that are a little off swings the wider the longer it is left alone.
+    """
+    steps, one_by_one = np.diff(phases), np.eye(len(phases) - 1)
+    rows = np.vstack([one_by_one, one_by_one[:1]])
+    at, through = [phases[:1]], [rows[:1]]
+    for k, step in enumerate(steps):
+        parts = max(1, round(step / steps.mean())) if step > GAP * steps.mean() else 1
+        share = np.arange(1, parts + 1)[:, None] / parts
+        at.append(phases[k] + share[:, 0] * step)
+        through.append((1 - share) * rows[k] + share * rows[k + 1])
+    return np.concatenate(at), np.concatenate(through)
 
 
 def between(phases: Float, count: int) -> Float:

@@ -42,14 +42,14 @@ class EnergyTank:
     Raises
     ------
     InputError
-        When a level is negative, or above the capacity.
+        When a level is negative, or above the capacity, or the capacity is infinite.
     """
 
     def __init__(self, level_mj: float = 5.0, capacity_mj: float = 20.0) -> None:
-        if not 0 <= level_mj <= capacity_mj:
+        if not 0 <= level_mj <= capacity_mj < math.inf:
             raise InputError(
                 f"energy tank: a level of {level_mj:g} mJ in a capacity of {capacity_mj:g} mJ; "
-                "needs 0 <= level_mj <= capacity_mj"
+                "needs 0 <= level_mj <= capacity_mj, and a finite capacity"
             )
         self.level_mj = level_mj
         self._capacity_mj = capacity_mj

@@ -62,6 +62,15 @@ def regular_steps(
             f"({along_mm:.2f} mm of it along the normal), {allowed_mm:.2f} mm are allowed; steps "
             f"along the normal are {lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
         )
+    # What positions of few decimals lean by; a grid has its axes at right angles.
+    upright_mm = (step_mm @ slices[0][0].normal) * slices[0][0].normal
+    aside_mm = float(np.linalg.norm(step_mm - upright_mm) * numbers[-1])
+    if aside_mm > allowed_mm:
+        raise InputError(
+            f"{where}: slices are shifted sideways, each beside the one before: from the first to "
+            f"the last by {aside_mm:.2f} mm, {allowed_mm:.2f} mm are allowed; resample the stack "
+            "to a grid with axes at right angles"
+        )
     too_wide = (counts > 2) | (lengths_mm > WIDEST_GAP_MM) if fill else True
     wide = np.flatnonzero((counts > 1) & too_wide)
     if len(wide):
@@ -79,7 +88,7 @@ def regular_steps(
             f"{slices[first + 1][0].where}: {lengths_mm[first]:.2f} mm apart, the others are "
             f"{usual_mm:.2f} mm apart{remedy}"
         )
-    return np.asarray(step_mm), np.asarray(numbers, np.int64)
+    return np.asarray(upright_mm), np.asarray(numbers, np.int64)
 
 
 def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, where: str) -> None:

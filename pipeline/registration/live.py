@@ -217,4 +217,4 @@ def prepare_follower(
 def information_of(covariance_mm2: Float, bending: Float) -> float:
     """Information per unit of curvature: so much that all frames' curvature together, ``(6, 6)``,
     is worth what the estimate's covariance says it was."""
-    return float(6 / np.trace(covariance_mm2 @ bending))
+    return float(6 / np.trace(covariance_mm2 @ rising(bending)))

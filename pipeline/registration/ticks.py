@@ -301,10 +301,21 @@ def _predict(c: Float) -> None:
 
 
 @inner
+def _beats_since(c: Float, now_s: float, rr_s: float) -> float:
+    """Beats since the last R peak, whole ones and the phase of this one, if the interval is
+    ``rr_s`` and the next come as due. It never falls as time goes on."""
+    turns = (now_s - c[LAST_R]) / rr_s
+    whole = math.floor(turns)
+    place = to_cycle(turns - whole, rr_s, c[CYCLE_RR])
+    # A phase that is rounded up to the next R peak is 0 there, with one whole beat more.
+    return float(whole + (1.0 if place == 0.0 and turns - whole > 0.5 else place))
+
+
+@inner
 def _place(c: Float, now_s: float, rr_s: float) -> float:
     """Where the heart should be, if the interval is ``rr_s`` and the next beats come as due."""
-    turns = (now_s - c[LAST_R]) / rr_s
-    return to_cycle(turns - math.floor(turns), rr_s, c[CYCLE_RR])
+    beats = _beats_since(c, now_s, rr_s)
+    return beats - math.floor(beats)
 
 
 @asked
@@ -361,10 +372,9 @@ def _watch(c: Float, now_s: float, usable: bool) -> None:
 @inner
 def _turn(c: Float, before_s: float, now_s: float) -> None:
     """Move the phase towards where the beats say, and judge it."""
-    place = _place(c, now_s, c[RR])
-    own = _place(c, before_s, c[RR])
-    turns = math.floor((now_s - c[LAST_R]) / c[RR]) - math.floor((before_s - c[LAST_R]) / c[RR])
-    natural = place - own + turns
+    there = _beats_since(c, now_s, c[RR])
+    natural = there - _beats_since(c, before_s, c[RR])
+    place = there - math.floor(there)
     if c[FADE] == 0.0 and c[VALID] == 0.0:
         c[PHASE] = place
     else:

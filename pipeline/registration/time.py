@@ -8,6 +8,7 @@ of one nominal beat, the MR's: systole keeps its length when the rate changes an
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Mask
@@ -18,8 +19,10 @@ OTHER_RATE = 1.8
 """Times by which one heart may beat faster or slower in another examination. A record told at twice
 its sampling rate, or half, is beyond."""
 LONGEST_BEAT = 1.75
-"""Times the median RR interval: a longer one may hold beats that were not found. The pause after an
-extrasystole is shorter, for it and the short interval before it make two."""
+"""Times the usual RR interval about it: a longer one may hold beats that were not found. The pause
+after an extrasystole is shorter, for it and the short interval before it make two."""
+# Over so many pairs of intervals the usual one is taken: rates change within a record.
+_NEIGHBOURS = 9
 _SHORTEST_RECORD_S = 3.0
 # Three years, which no recording lasts: such times are counted from 1970.
 _SINCE_1970_S = 1e8
@@ -116,8 +119,12 @@ def in_known_beats(times_s: Float, r_times_s: Float) -> Mask:
 
     Before the first R peak and after the last, where the median stands in, times do.
     """
-    longest_s = LONGEST_BEAT * median_rr_s(r_times_s)
-    too_long = np.concatenate([[False], np.diff(r_times_s) > longest_s, [False]])
+    rr_s = np.diff(r_times_s)
+    # Of neighbours together: in bigeminy one is short and the next long, beat after beat.
+    pairs_s = (rr_s[:-1] + rr_s[1:]) / 2 if len(rr_s) > 1 else rr_s
+    usual_s = median_filter(pairs_s, _NEIGHBOURS, mode="nearest")
+    longest_s = LONGEST_BEAT * np.concatenate([usual_s[:1], usual_s])[: len(rr_s)]
+    too_long = np.concatenate([[False], rr_s > longest_s, [False]])
     return np.asarray(~too_long[np.searchsorted(r_times_s, times_s, side="right")])
 
 

@@ -17,7 +17,7 @@ from numba import njit
 from scipy.ndimage import gaussian_filter
 
 from pipeline.errors import InputError
-from pipeline.field.motion import Motion, between
+from pipeline.field.motion import GAP, Motion, between
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
@@ -35,8 +35,6 @@ _MARGIN_MM = 12.0
 # Longer ways between phases are shortened: half-way between two pictures of blood a wall that moved
 # by more than its blur is two faint walls.
 _LONGEST_STEP = 0.06
-# A step longer than so many mean ones is a gap in the phases: no spline knows the way through it.
-_GAP = 1.5
 # Phases that are worked on at the same time: NumPy and SciPy let others run while they count.
 _THREADS = 2
 
@@ -146,7 +144,7 @@ def in_short_steps(surfaces: Mapping[str, MovingSurface]) -> dict[str, MovingSur
 def _in_short_steps(surface: MovingSurface) -> MovingSurface:
     longest = np.diff(surface.phases, append=surface.phases[0] + 1).max()
     count = math.ceil(longest / _LONGEST_STEP)
-    even = longest * len(surface.phases) <= _GAP
+    even = longest * len(surface.phases) <= GAP
     motion = Motion.of(surface) if count > 1 and even else None
     if motion is None:
         return surface

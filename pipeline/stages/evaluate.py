@@ -210,7 +210,12 @@ def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
     """
     errors = []
     for row in read_frames(job.products / "register" / "frames.csv"):
-        sweep = known["us_frames"][row.sweep]
+        sweep = known["us_frames"].get(row.sweep)
+        if sweep is None:
+            raise InputError(
+                f"{job.study.folder / 'truth' / 'truth.json'}: knows no sweep {row.sweep}, only "
+                f"{', '.join(known['us_frames'])}; give the files their names, or take truth/ out"
+            )
         nearest = int(np.abs(np.array(sweep["times_s"]) - row.time_s).argmin())
         true = sweep["mechanical_phases"][nearest]
         errors.append(phase_error(np.array(row.phase), np.array(true)))

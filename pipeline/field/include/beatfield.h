@@ -2048,7 +2048,7 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
 {
     bf_tank tank;
     memset(&tank, 0, sizeof tank);
-    tank.capacity_mj = capacity_mj > 0 ? capacity_mj : 0;
+    tank.capacity_mj = capacity_mj > 0 && bf__numeric(capacity_mj) ? capacity_mj : 0;
     tank.level_mj = level_mj > 0 ? level_mj : 0;
     if (tank.level_mj > tank.capacity_mj) tank.level_mj = tank.capacity_mj;
     return tank;

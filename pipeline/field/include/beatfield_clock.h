@@ -389,11 +389,21 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
     return early && !settled ? BF_ECTOPIC_BEAT : BF_NORMAL_BEAT;
 }
 
+/* Beats since the last R peak, whole ones and the phase of this one, if the interval is rr_s and the
+ * next come as due. It never falls as time goes on. */
+static double bfc_beats_since(const bf_clock *c, double now_s, double rr_s)
+{
+    double turns = (now_s - c->known.last_r_s) / rr_s, whole = floor(turns);
+    double place = bf_to_cycle(turns - whole, rr_s, c->cycle_rr_s);
+    /* A phase that is rounded up to the next R peak is 0 there, with one whole beat more. */
+    return whole + (place == 0.0 && turns - whole > 0.5 ? 1.0 : place);
+}
+
 /* Where the heart should be, if the interval is rr_s and the next beats come as due. */
 static double bfc_place(const bf_clock *c, double now_s, double rr_s)
 {
-    double turns = (now_s - c->known.last_r_s) / rr_s;
-    return bf_to_cycle(turns - floor(turns), rr_s, c->cycle_rr_s);
+    double beats = bfc_beats_since(c, now_s, rr_s);
+    return beats - floor(beats);
 }
 
 /* Notice that no lead shows anything, or that a beat is overdue. */
@@ -418,10 +428,9 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
 /* Move the phase towards where the beats say, and judge it. */
 static void bfc_turn(bf_clock *c, double before_s, double now_s)
 {
-    double last_r_s = c->known.last_r_s, rr_s = c->known.rr_s;
-    double place = bfc_place(c, now_s, rr_s), own = bfc_place(c, before_s, rr_s);
-    double turns = floor((now_s - last_r_s) / rr_s) - floor((before_s - last_r_s) / rr_s);
-    double natural = place - own + turns, off, h, by_interval, by_peak, near_enough;
+    double rr_s = c->known.rr_s, there = bfc_beats_since(c, now_s, rr_s);
+    double natural = there - bfc_beats_since(c, before_s, rr_s), place = there - floor(there);
+    double off, h, by_interval, by_peak, near_enough;
     if (c->fade == 0.0 && !c->valid) {
         c->phase = place;
     } else {
