@@ -292,7 +292,7 @@ class ForceField:
         """Force and torque on a whole tool: the mean of the field's force over its length.
 
         A tool thus feels no more than ``f_max``. Its lines are divided where the field demands
-        it, until the error of the force is below ``bound_n``.
+        it, until halving it once more would change the force by less than ``bound_n``.
 
         Parameters
         ----------

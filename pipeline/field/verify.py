@@ -119,7 +119,7 @@ def _fixture_words(one: Mapping[str, Any]) -> str:
     beyond, late = one["beyond_limit_share"], one["force_change_max_n_per_ms"]
     holding = f"{one['stiffness_any_direction_p99_n_per_m']:.0f} in any direction at 99 % of places"
     share = "" if beyond is None else f", {beyond:.2%} are beyond the device"
-    step = f"force changes by at most {one['force_step_max_n_per_0_1_mm']:.3f} N over 0.1 mm"
+    step = f"largest change of force found: {one['force_step_max_n_per_0_1_mm']:.3f} N over 0.1 mm"
     time = "" if late is None else f", {late:.3f} N over 1 ms"
     return f"{stiffness_words(one)}; {holding}{share}; {step}{time}"
 
