@@ -305,7 +305,7 @@ class ForceField:
         fixture
             Which; the first when None.
         bound_n
-            Largest error, newtons.
+            The most that halving may change, newtons: an estimate of the error.
 
         Raises
         ------
