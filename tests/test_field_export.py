@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -210,13 +211,30 @@ def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):
         (path, "mhd", str(path / "inside"), "lies inside the field"),
         (tmp_path / "50%.zarr", "mhd", new, "take a % in the path"),
         (tmp_path / "two\nlines.zarr", "mhd", new, "ends where the path"),
-        (path, "vti", os.fsdecode(os.fsencode(new) + b"\xe9"), "only where the path is UTF-8"),
     ]:
         assert main(["export", str(field), "--to", form, "--out", out]) == 2
         assert words in capsys.readouterr().err
     left = sorted(one.name for one in tmp_path.iterdir())
     assert left == ["50%.zarr", "broken.zarr", "taken", "two\nlines.zarr"]
     assert (taken / "mine.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize("form", [one for one in WRITERS if one != "mhd"])
+def test_files_that_cannot_be_written_whole_are_refused_and_leave_nothing(path, form, tmp_path):
+    """Of headers that point into the store alone, as mhd has them, no file is long."""
+    script = (
+        "import resource, sys\n"
+        "from pipeline.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))\n"
+        f"sys.exit(main(['export', {str(path)!r}, '--to', {form!r}, '--out', 'new']))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.startswith("error: new: a file would be larger than `ulimit -f`")
+    assert len(ended.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_killed_export_left_is_cleared_away_and_a_living_ones_is_not(path, tmp_path):
