@@ -14,7 +14,7 @@ from ellipsoid_heart import (
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.registration.live import prepare_follower
+from pipeline.registration.live import information_of, prepare_follower
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
 
@@ -100,3 +100,9 @@ def test_phase_must_lie_in_the_beat(prepared, later):
     sweep, image, pose, *_ = later[0]
     with pytest.raises(InputError, match=r"\[0, 1\), got 1.0"):
         follower.follow(state, lattices[sweep], image, pose, 1.0)
+
+
+def test_a_loss_that_bends_down_in_one_direction_still_tells_something() -> None:
+    """Six parameters of unit variance, five of which the frames tell, each with a bending of 20."""
+    bending = np.diag([20.0] * 5 + [-150.0])
+    assert information_of(np.eye(6), bending) == pytest.approx(6 / 100)
