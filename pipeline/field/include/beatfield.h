@@ -162,11 +162,12 @@ typedef struct {
 
 /* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL), both
  * in the frame of the MR: the mean of the field's force over the tool's length, so no tool feels more
- * than f_max. Pieces are halved where the field demands it, until halving them once more would
- * change the force by less than bound_n; evaluations (may be NULL) says how often the field was asked. mr_from_tool is a rotation and
- * a shift, within 1e-3, row after row; the last row is 0 0 0 1. A tool longer than 20 times the grid's
- * diagonal, as one in micrometres, is refused: BF_WRONG_SIZE. How long an answer takes grows with the
- * tool's length in the field's reach and its number of points, and as bound_n becomes less. */
+ * than f_max. Pieces are halved where the field demands it, until halving them once more would change
+ * the force by less than bound_n; evaluations (may be NULL) says how often the field was asked.
+ * mr_from_tool is a rotation and a shift, within 1e-3, row after row; the last row is 0 0 0 1. A tool
+ * longer than 20 times the grid's diagonal, as one in micrometres, is refused: BF_WRONG_SIZE. How long
+ * an answer takes grows with the tool's length in the field's reach and its number of points, and as
+ * bound_n becomes less. */
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         const double mr_from_tool[16], double phase, double bound_n,
                         double force_n[3], double torque_nmm[3], int *evaluations);
