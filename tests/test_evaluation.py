@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from pipeline.evaluation.metrics import (
 )
 from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
+from pipeline.products import FrameRow, write_frames
+from pipeline.stages.evaluate import _frame_phase_errors
 from pipeline.surface.measures import (
     distances_mm,
     ejection_fraction,
@@ -233,3 +236,14 @@ def test_moving_both_surfaces_together_changes_no_distance(turn, place):
     here, there = surface_distance(first, second, 500), surface_distance(*moved, 500)
     assert there.mean_mm == pytest.approx(here.mean_mm, abs=1e-9)
     assert there.hausdorff95_mm == pytest.approx(here.hausdorff95_mm, abs=1e-9)
+
+
+def test_truth_of_sweeps_by_other_names_is_told(tmp_path):
+    (tmp_path / "register").mkdir()
+    row = FrameRow("left", 0, 3.0, 0.25, 0.1, valid=True)
+    write_frames(tmp_path / "register" / "frames.csv", [row])
+    job = SimpleNamespace(products=tmp_path, study=SimpleNamespace(folder=tmp_path))
+    one = {"times_s": [2.9, 3.0], "mechanical_phases": [0.1, 0.2]}
+    assert _frame_phase_errors(job, {"us_frames": {"left": one}}) == pytest.approx([0.05])
+    with pytest.raises(InputError, match=r"truth\.json: knows no sweep left, only sweep_000; give"):
+        _frame_phase_errors(job, {"us_frames": {"sweep_000": one}})
