@@ -49,7 +49,7 @@ def stream(rng: np.random.Generator) -> np.ndarray:
         if mood == 5:
             rows.append((1, now_s - rng.choice([5.0, 0.015, 0.025]), True))
         if mood == 11 and rng.random() < 0.3:
-            rows.append((1, rng.choice([np.nan, np.inf, now_s + 900.0]), True))
+            rows.append((1, rng.choice([np.nan, np.inf, 1.7e308, now_s + 900.0]), True))
         if mood == 7:
             rows.append((0, r_s + 1000.0, False))
         if mood == 9:

@@ -139,7 +139,9 @@ class PhaseClock:
 
         Where the last beat lies more than 0.02 s ahead of it, beats and questions are timed by
         different clocks: all beats are forgotten, and the rhythm is learnt anew. The fade moves by
-        0.02 s' worth at most, however long nobody asked.
+        0.02 s' worth at most, and while it is not 0 the phase by 0.15 s' worth, however long nobody
+        asked, unless a beat was told of that time: a phase that is then too far off is not valid
+        until it was faded out and set.
 
         Parameters
         ----------
@@ -154,8 +156,9 @@ class PhaseClock:
         Raises
         ------
         InputError
-            When the time is before the last one, or not a number. If it is so by more than 0.02 s,
-            beats are forgotten, the fade falls as in a millisecond, and time goes on from there.
+            When the time is before the last one, not a number, or beyond 1e11 s. If it is so by
+            more than 0.02 s, beats are forgotten, the fade falls as in a millisecond, and time goes
+            on from there.
         """
         c = self._state
         before_s = c[ticks.NOW]

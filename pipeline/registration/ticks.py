@@ -42,6 +42,11 @@ SLACK_S = 0.02
 time before the one before it; and how much time one step of the fade may make up for."""
 TICK_S = 0.001
 """What is taken to have passed where the time tells nothing: a turn of a haptic loop."""
+HELD_UP_S = 0.1
+"""The phase moves by no more than this makes up for in one answer, unless a beat was told of the
+time between: a loop that was held up for longer, or whose time was set, would render a jump."""
+MOST_TIME_S = 1e11
+"""A number beyond is no time in seconds: three thousand years, and too coarse for a phase."""
 
 LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
 NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
@@ -120,6 +125,11 @@ def _forget(c: Float) -> None:
     c[BEFORE:] = c[STATE:BEFORE]
 
 
+@inner
+def _is_time(time_s: float) -> bool:
+    return bool(abs(time_s) <= MOST_TIME_S)
+
+
 @asked
 def tolerance(c: Float) -> float:
     """How far from its predicted time a regular beat may come, seconds."""
@@ -147,7 +157,7 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     """An R peak became known; what kind of beat it is, or -1 if it does not count: it is no later
     than the last, or too far ahead of all that the clock was told."""
     c[BEFORE:] = c[STATE:BEFORE]
-    if not math.isfinite(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
+    if not _is_time(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
         return -1
     # The last beat counts beside the time: the next question may lie far from the last one.
     if (c[STARTED] > 0.0 or c[BEATS] > 0.0) and r_s > _latest(c) + AHEAD_S:
@@ -324,11 +334,12 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
 
     Afterwards ``c`` holds phase, its standard deviation, state, validity and fade.
     """
-    if not math.isfinite(now_s) or (c[STARTED] > 0.0 and now_s < c[NOW]):
+    if not _is_time(now_s) or (c[STARTED] > 0.0 and now_s < c[NOW]):
         _lose_time(c, now_s)
         return -1
     passed_s = now_s - c[NOW] if c[STARTED] > 0.0 else 0.0
-    before_s = now_s - passed_s
+    told = c[BEATS] > 0.0 and c[LAST_R] > now_s - passed_s
+    before_s = now_s - (passed_s if told else min(passed_s, HELD_UP_S))
     c[STARTED], c[NOW] = 1.0, now_s
     if c[BEATS] > 0.0 and c[LAST_R] > now_s + SLACK_S:
         # Left in, it would shift the phase, and make true beats come too late.
@@ -344,12 +355,12 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
 @inner
 def _lose_time(c: Float, now_s: float) -> None:
     """A time that is none, or of another clock: what beats told of is worth nothing any more."""
-    if math.isfinite(now_s) and now_s >= c[NOW] - SLACK_S:
+    if _is_time(now_s) and now_s >= c[NOW] - SLACK_S:
         return
     _forget(c)
     c[STATE], c[GOOD], c[VALID] = LOST, 0.0, 0.0
     c[FADE] = max(c[FADE] - c[FADE_PER_S] * TICK_S, 0.0)
-    if math.isfinite(now_s):
+    if _is_time(now_s):
         c[NOW] = now_s
 
 

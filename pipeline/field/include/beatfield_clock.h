@@ -99,8 +99,10 @@ void bf_take_back(bf_clock *clock);
  * loop are timed by different clocks: all are forgotten, and the rhythm is learnt anew. Returns 0, or
  * -1 when the time is no number or lies before the last one. Up to 0.02 s before, nothing changes.
  * Otherwise the phase is not valid, beats are forgotten, the fade falls as in a millisecond, and
- * from then on time is counted from there. In one call the fade moves by 0.02 s' worth at most,
- * however long the loop was held up. */
+ * from then on time is counted from there. In one call the fade moves by 0.02 s' worth at most, and
+ * while it is not 0 the phase by 0.15 s' worth, however long the loop was held up, unless a beat was
+ * told of that time: a phase that is then too far off is not valid until it was faded out and set.
+ * More than 1e11 s are no time. */
 int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
 
 /* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. */
@@ -141,9 +143,13 @@ extern "C" {
 #define BFC_AHEAD_S 3.0
 #define BFC_SLACK_S 0.02
 #define BFC_TICK_S 0.001
+#define BFC_HELD_UP_S 0.1
+#define BFC_MOST_TIME_S 1e11
 
 static double bfc_min(double a, double b) { return b < a ? b : a; }
 static double bfc_max(double a, double b) { return b > a ? b : a; }
+
+static int bfc_is_time(double time_s) { return fabs(time_s) <= BFC_MOST_TIME_S; }
 
 static double bfc_systole_share(double rr_s)
 {
@@ -358,7 +364,7 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
     double rr_s, off_s;
     int known, regular, early, place, settled;
     c->before = c->known;
-    if (!isfinite(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
+    if (!bfc_is_time(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
         return BF_NO_BEAT;
     /* The last beat counts beside the time: the next question may lie far from the last one. */
     if ((c->started || c->known.beats > 0.0) && r_s > bfc_latest(c) + BFC_AHEAD_S)
@@ -452,32 +458,34 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
 /* A time that is none, or of another clock: what beats told of is worth nothing any more. */
 static void bfc_lose_time(bf_clock *c, double now_s)
 {
-    if (isfinite(now_s) && now_s >= c->now_s - BFC_SLACK_S)
+    if (bfc_is_time(now_s) && now_s >= c->now_s - BFC_SLACK_S)
         return;
     bfc_forget(c);
     c->known.rhythm = BF_LOST;
     c->known.good = 0;
     c->valid = 0;
     c->fade = bfc_max(c->fade - c->fade_per_s * BFC_TICK_S, 0.0);
-    if (isfinite(now_s))
+    if (bfc_is_time(now_s))
         c->now_s = now_s;
 }
 
 int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
 {
-    int wrong = !isfinite(now_s) || (c->started && now_s < c->now_s);
+    int wrong = !bfc_is_time(now_s) || (c->started && now_s < c->now_s);
     if (wrong) {
         bfc_lose_time(c, now_s);
     } else {
         double passed_s = c->started ? now_s - c->now_s : 0.0;
         double reach = c->fade_per_s * bfc_min(passed_s, BFC_SLACK_S);
+        int told = c->known.beats > 0.0 && c->known.last_r_s > now_s - passed_s;
+        double before_s = now_s - (told ? passed_s : bfc_min(passed_s, BFC_HELD_UP_S));
         c->started = 1;
         c->now_s = now_s;
         /* Left in, it would shift the phase, and make true beats come too late. */
         if (c->known.beats > 0.0 && c->known.last_r_s > now_s + BFC_SLACK_S)
             bfc_forget(c);
         bfc_watch(c, now_s, usable);
-        bfc_turn(c, now_s - passed_s, now_s);
+        bfc_turn(c, before_s, now_s);
         c->fade += bfc_min(bfc_max((double)(c->valid && !c->withheld) - c->fade, -reach), reach);
     }
     if (tick) {
