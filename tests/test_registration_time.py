@@ -14,6 +14,7 @@ from sweep_files import good_fields, write
 from data_synth.ecg import EcgSettings, simulate_ecg
 from pipeline.errors import InputError
 from pipeline.geometry import Float
+from pipeline.imaging.ecg import Ecg
 from pipeline.registration.time import (
     detect_r_peaks,
     doubts_of_rate,
@@ -303,18 +304,33 @@ def test_bigeminy_and_another_rate_have_phases_throughout(beats):
     assert in_known_beats(asked_s[~inside], missed_s).all()
 
 
+def test_times_at_the_ends_have_no_phase_where_the_leads_were_lost():
+    r_times_s = np.array([5.0, 5.8, 6.6, 7.4])
+    times_s = np.array([3.0, 4.1, 4.3, 5.5, 8.1, 8.3, 11.0])
+    known = in_known_beats(times_s, r_times_s, (3.5, 10.0))
+    assert known.tolist() == [True, False, True, True, True, False, True]
+    # What the record covers has its phases now, and what it does not is refused as ever.
+    phases_at(times_s[1:-1][known[1:-1]], r_times_s)
+    with pytest.raises(InputError, match="2 of 5 times"):
+        phases_at(times_s[known], r_times_s)
+
+
 def test_frames_without_a_beat_are_left_out_and_told(tmp_path):
     path = write(tmp_path / "fan.mha", good_fields())
     files = UltrasoundFiles(sweeps=(path,))
     study = SimpleNamespace(us=files, ecg=SimpleNamespace(us=tmp_path / "us"))
     # Frames at 3.0 to 3.2 s: two within the last beat before the ECG shows none for 3 s.
     r_times_s = np.array([0.7, 1.5, 2.27, 3.08, 6.1, 6.9, 7.7])
-    (sweep,) = _sweeps(study, r_times_s)
+    ecg = Ecg(np.zeros((4500, 1)), ("I",), 500.0)
+    (sweep,) = _sweeps(study, ecg, r_times_s)
     assert sweep.numbers.tolist() == [0, 1]
     assert sweep.images.shape[0] == len(sweep.times_s) == len(sweep.tracker_from_image) == 2
     assert sweep.remarks[-1].startswith("3 of 5 frames, between 3.10 and 3.20 s, left out")
     with pytest.raises(InputError, match=r"fan\.mha, beside .*us: 5 of 5 frames.* whole"):
-        _sweeps(study, r_times_s - 0.5)
+        _sweeps(study, ecg, r_times_s - 0.5)
+    # The leads are lost for good after the first frames.
+    (cut,) = _sweeps(study, ecg, r_times_s[:4] - 0.76)
+    assert cut.numbers.tolist() == [0, 1, 2]
 
 
 def test_median_rr_is_that_of_the_intervals():

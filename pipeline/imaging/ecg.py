@@ -54,6 +54,12 @@ class Ecg:
     patient: str = ""
     """The patient's identifier; empty where the file does not tell, as of all formats but DICOM."""
 
+    @property
+    def recorded_s(self) -> tuple[float, float]:
+        """Times of the first and of the last sample."""
+        lasts_s = (len(self.signal_mv) - 1) / self.sampling_rate_hz
+        return self.start_s, self.start_s + lasts_s
+
 
 def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
     """Read one recording.

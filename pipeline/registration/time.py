@@ -114,10 +114,14 @@ def phases_at(times_s: Float, r_times_s: Float, cycle_rr_s: float | None = None)
     return share if cycle_rr_s is None else to_cycle(share, own_s, cycle_rr_s)
 
 
-def in_known_beats(times_s: Float, r_times_s: Float) -> Mask:
+def in_known_beats(
+    times_s: Float, r_times_s: Float, recorded_s: tuple[float, float] | None = None
+) -> Mask:
     """Whether each time ``(n,)`` lies in an RR interval that can be one beat: others have no phase.
 
-    Before the first R peak and after the last, where the median stands in, times do.
+    Before the first R peak and after the last, where the median stands in, times do. Farther out
+    they do not, if they lie within ``recorded_s``, first and last time of the record: the leads
+    were lost there. What lies beyond the record is left to :func:`phases_at`, which refuses it.
     """
     rr_s = np.diff(r_times_s)
     # Of neighbours together: in bigeminy one is short and the next long, beat after beat.
@@ -125,7 +129,12 @@ def in_known_beats(times_s: Float, r_times_s: Float) -> Mask:
     usual_s = median_filter(pairs_s, _NEIGHBOURS, mode="nearest")
     longest_s = LONGEST_BEAT * np.concatenate([usual_s[:1], usual_s])[: len(rr_s)]
     too_long = np.concatenate([[False], rr_s > longest_s, [False]])
-    return np.asarray(~too_long[np.searchsorted(r_times_s, times_s, side="right")])
+    known = ~too_long[np.searchsorted(r_times_s, times_s, side="right")]
+    first_s, last_s = recorded_s or (np.inf, -np.inf)
+    median_s = median_rr_s(r_times_s)
+    before = (times_s >= first_s) & (times_s < r_times_s[0] - median_s)
+    after = (times_s >= r_times_s[-1] + median_s) & (times_s <= last_s)
+    return np.asarray(known & ~before & ~after)
 
 
 def _other_clock(times_s: Float, start_s: float, end_s: float) -> str:

@@ -37,7 +37,7 @@ def run(job: Job) -> dict[str, Any]:
     start = _start(job)
     ecg = _ecg(job.study)
     r_times_s = _r_times_s(job.study, ecg)
-    sweeps = _sweeps(job.study, r_times_s)
+    sweeps = _sweeps(job.study, ecg, r_times_s)
     cycle = read_table(job.products / "ingest" / "phases.json")
     surfaces = read_surfaces(job.products / "surface", np.array(cycle["phases"]))
     timing = _timing(job.study, sweeps, r_times_s, cycle["rr_s"])
@@ -75,8 +75,9 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
     """
     if study.us is None:
         return
-    r_times_s = _r_times_s(study, _ecg(study))
-    sweeps = _sweeps(study, r_times_s)
+    ecg = _ecg(study)
+    r_times_s = _r_times_s(study, ecg)
+    sweeps = _sweeps(study, ecg, r_times_s)
     timing = _timing(study, sweeps, r_times_s, None)
     if settings.on_failure == "stop":
         require_frames(sweeps, timing.phases(), settings)
@@ -112,12 +113,12 @@ def _registered(
         raise Skipped(f"{said}; the field is in the frame of the MR") from error
 
 
-def _sweeps(study: Study, r_times_s: Float) -> list[Sweep]:
+def _sweeps(study: Study, ecg: Ecg, r_times_s: Float) -> list[Sweep]:
     """The sweeps, without frames that were taken while the ECG shows no beat."""
     assert study.us is not None, "only a study with ultrasound is registered"
     sweeps = []
     for path, sweep in zip(study.us.sweeps, read_sweeps(study.us), strict=True):
-        known = in_known_beats(sweep.times_s, r_times_s)
+        known = in_known_beats(sweep.times_s, r_times_s, ecg.recorded_s)
         told = [] if known.all() else [_told_of_pause(sweep.times_s[~known], len(known))]
         if not known.any():
             raise InputError(f"{path}, beside {study.ecg.us}: {told[0]}; give its own ECG, whole")
