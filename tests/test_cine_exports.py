@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -385,13 +385,14 @@ def test_one_rr_interval_for_all_serves_prospective_triggering(tmp_path: Path) -
     np.testing.assert_allclose(cine.phases, 150 * np.arange(PHASES) / 900)
 
 
+@pytest.mark.parametrize("matrix", [coarser, list])
 @pytest.mark.parametrize("untold", [False, True])
-@pytest.mark.parametrize("slices", [range(SLICES), range(1, SLICES + 2)])
+@pytest.mark.parametrize("slices", [range(SLICES), range(1, SLICES + 2), [2]])
 def test_images_in_real_time_do_not_go_before_a_cine_for_their_number(
-    tmp_path: Path, slices: range, untold: bool
+    tmp_path: Path, slices: Sequence[int], untold: bool, matrix: Callable[..., list[FileDataset]]
 ) -> None:
-    """Their times run through many beats."""
-    beats = coarser(series([*slices], [200.0 * k for k in range(4 * PHASES)]))
+    """Their times run through many beats; they may have the cine's own matrix."""
+    beats = matrix(series([*slices], [200.0 * k for k in range(4 * PHASES)]))
     if untold:
         for data in beats:
             del data.NominalInterval

@@ -59,7 +59,7 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
         spacing or pixel direction; or two stacks of different directions are equally large.
     """
     frames, copies = _without_copies(frames)
-    ranked = _ranked(sets_alike(frames))
+    ranked = _ranked([part for one in sets_alike(frames) for part in _by_pace(one)])
     _require_one_largest(ranked, where)
     stack, stills = _without_stills(ranked[0][1])
     left_out = copies + _spared(stills, "one moment of the beat, no cine")
@@ -147,11 +147,35 @@ def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str)
             )
 
 
-def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
-    """Part series that are no cine, but of the matrix of cines, from these."""
+def _by_pace(frames: list[Frame]) -> list[list[Frame]]:
+    """Part series in real time from a cine that has slices of theirs, and their very matrix."""
+    by_series = _by_series(frames)
+    slow = {name for name, one in by_series.items() if not are_in_one_beat(one)}
+    cine = [frame for frame in frames if frame.series_uid not in slow]
+    if not slow or not cine or not is_cine(cine):
+        return [frames]
+    slices_mm, normal = slice_positions(cine), cine[0].normal
+    # A slice of which there is no other is the cine's own, and runs over its beat.
+    slow = {
+        name
+        for name in slow
+        if any(_covered([frame], normal, slices_mm) for frame in by_series[name])
+    }
+    gated = [frame for frame in frames if frame.series_uid not in slow]
+    running = [frame for frame in frames if frame.series_uid in slow]
+    return [gated, running] if running else [gated]
+
+
+def _by_series(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
     by_series: dict[str, list[Frame]] = {}
     for frame in frames:
         by_series.setdefault(frame.series_uid, []).append(frame)
+    return by_series
+
+
+def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
+    """Part series that are no cine, but of the matrix of cines, from these."""
+    by_series = _by_series(frames)
     single = {name for name, one in by_series.items() if max(count_moments(one)) < MIN_PHASES}
     moving = {name for name, one in by_series.items() if name not in single and span_beat(one)}
     cine = [frame for frame in frames if frame.series_uid in moving]
