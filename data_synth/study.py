@@ -138,7 +138,7 @@ def publishing(target: Path) -> Iterator[Path]:
         if old.exists() and not target.exists():
             old.rename(target)
         raise SynthError(
-            f"{target}: cannot be written ({error.strerror}: {error.filename}); "
+            f"{target}: cannot be written ({error.strerror}: {error.filename or partial}); "
             "mend the place or choose another"
         ) from error
     finally:

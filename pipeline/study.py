@@ -153,8 +153,12 @@ def open_study(folder: Path) -> Study:
 
 
 def studies_in(folder: Path) -> list[Path]:
-    """The folders directly below ``folder`` that are studies, in order of their names."""
-    return sorted(path for path in folder.iterdir() if path.is_dir() and _is_study(path))
+    """The folders directly below ``folder`` that are studies, in order of their names.
+
+    Hidden ones are not: in them programs write what is not yet whole.
+    """
+    seen = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in seen if path.is_dir() and _is_study(path))
 
 
 def _is_study(folder: Path) -> bool:

@@ -91,6 +91,16 @@ def test_a_patient_is_not_called_what_the_batch_writes(studies: Path, name: str)
     assert f"other than '{name}'" in rows["bad"]["cause"]
 
 
+def test_a_study_that_is_not_yet_whole_is_none(studies: Path) -> None:
+    """As it is left where the program that wrote it was killed."""
+    make_study(studies / ".p2.partial-77")
+    (studies / ".p2.partial-77" / "study.yaml").write_text("patient_id: p2\n")
+    make_study(studies / "inner" / ".p3.partial-78")
+    make_study(studies / "inner" / "p3")
+    assert batch(studies) == 0
+    assert rows_of(studies.parent / "out").keys() == {"good", "inner"}
+
+
 def test_a_study_one_level_deeper_is_run_and_several_are_told(studies: Path) -> None:
     make_study(studies / "one" / "inner")
     for name in ("a", "b"):

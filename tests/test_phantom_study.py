@@ -323,6 +323,14 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         write_study(tmp_path / "file" / "patient-0001", small(cine_only=True))
 
 
+def test_a_full_disk_is_told_with_the_place(tmp_path):
+    with (
+        pytest.raises(SynthError, match=r"No space left on device: .*\.p\.partial-"),
+        publishing(tmp_path / "p"),
+    ):
+        raise OSError(28, "No space left on device")
+
+
 def test_every_setting_and_every_entry_of_the_truth_is_documented(truth):
     page = Path("docs/phantom.md").read_text()
     # `python -m data_synth.settings_table` prints what belongs there.

@@ -30,7 +30,7 @@ class SegmentSettings(Section):
     grid_mm: float = Field(1.5, ge=0.5, le=4)
     """Spacing of the isotropic grid."""
 
-    margin_mm: float = Field(12.0, ge=0)
+    margin_mm: float = Field(12.0, ge=0, le=100)
     """Empty space kept around the heart on the isotropic grid."""
 
     correct_shifts: bool = True
