@@ -301,7 +301,8 @@ class TestRefusals:
     def test_too_few_frames_are_refused_at_once_unless_the_study_may_go_on(
         self, monkeypatch, tmp_path
     ):
-        monkeypatch.setattr(stage, "_ecg", lambda _: None)
+        ecg = SimpleNamespace(recorded_s=(0.0, 9.0))
+        monkeypatch.setattr(stage, "_ecg", lambda _: ecg)
         monkeypatch.setattr(stage, "_r_times_s", lambda *_: np.arange(1.0, 6.0, 0.8))
         us = UltrasoundFiles(sweeps=(write(tmp_path / "fan.mha", good_fields()),))
         study = SimpleNamespace(us=us, ecg=SimpleNamespace(us=tmp_path / "us"))
