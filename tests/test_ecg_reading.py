@@ -382,3 +382,39 @@ def test_names_of_leads_are_no_units(tmp_path):
     lines = [f"{k / 250:.3f},{k % 7},{k % 5}" for k in range(1000)]
     (tmp_path / "ecg.csv").write_text("\n".join(["time_s,I (mV),lead (II)", *lines]))
     assert read_ecg(tmp_path / "ecg.csv").leads == ("I (mV)", "lead (II)")
+
+
+@pytest.mark.parametrize("name", ["ABP (mmHg)", "Resp (Ohm)", "II (NU)", "II [counts]", "x (1)"])
+def test_a_csv_column_that_is_no_voltage_is_refused(tmp_path, name):
+    """It has beats of its own, later than those of the heart's electricity."""
+    with pytest.raises(InputError, match=r"is in .* millivolts of an ECG: take the col"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", header=f"time_s,I,{name}"))
+
+
+@pytest.mark.parametrize("name", ["lead (aVR)", "ECG [V5]", "ml (MLII)", "I (mV)", "I ()"])
+def test_a_lead_in_brackets_is_no_unit(tmp_path, name):
+    assert read_ecg(write_csv(tmp_path / "ecg.csv", header=f"time_s,I,{name}")).leads[1] == name
+
+
+def test_segments_in_other_units_or_with_a_gap_are_refused(tmp_path):
+    for name, unit in (("one", "mV"), ("two", "uV"), ("three", "mV")):
+        write_wfdb(tmp_path, units=unit, name=name)
+    whole = tmp_path / "whole.hea"
+    whole.write_text(f"whole/2 2 {RATE_HZ} 2000\none 1000\nthree 1000\n")
+    assert read_ecg(whole).signal_mv.shape == (2000, 2)
+    whole.write_text(f"whole/2 2 {RATE_HZ} 2000\none 1000\ntwo 1000\n")
+    with pytest.raises(InputError, match="segments give one signal in different units"):
+        read_ecg(whole)
+    whole.write_text(f"whole/3 2 {RATE_HZ} 2100\none 1000\n~ 100\nthree 1000\n")
+    with pytest.raises(InputError, match=r"a gap between its segments \(~\)"):
+        read_ecg(whole)
+
+
+def test_of_groups_of_channels_the_longest_of_voltages_is_read(tmp_path):
+    """A pressure beside it has more samples."""
+    pressure = waveform_group(np.concatenate([STEPS_UV, STEPS_UV])[:, :1], "mm[Hg]")
+    averaged = waveform_group(STEPS_UV[:400], "uV")
+    averaged.SamplingFrequency = str(RATE_HZ / 2)
+    groups = [pressure, averaged, waveform_group(STEPS_UV, "uV")]
+    ecg = read_ecg(write_dicom(tmp_path / "ecg.dcm", groups))
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0)

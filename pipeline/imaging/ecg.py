@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -17,22 +16,13 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Mask
+from pipeline.imaging.ecg_csv import read_csv
+from pipeline.imaging.voltages import is_voltage, millivolts
 from pipeline.study_files import names_in_header
-
-MILLIVOLTS = {"v": 1e3, "mv": 1.0, "uv": 1e-3, "nv": 1e-6}
-"""Millivolts in one unit, by its name in lower case."""
 
 MICRO_UNIT = re.compile(rb"^[^#\s]\S*\s+\S+\s+\S*/\S*?(?:\xb5|\xce\xbc)", re.MULTILINE)
 """A signal's line whose unit, after file and format, has a micro sign (Latin-1 or UTF-8, where
 another byte stands before it) or the Greek letter."""
-
-UNIT_OF_LEAD = re.compile(r"[(\[]\s*([^\W\d_]{1,2})\s*[)\]]$")
-"""A unit behind a lead's name, as in ``I (uV)``."""
-
-# Samples a second of an ECG: no two units of time that are a thousandfold apart both fit.
-_RATES_HZ = (100.0, 2000.0)
-# Steps by which times of samples that were taken in order may stray from an even grid.
-_JITTER_STEPS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +84,7 @@ def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
             "a .csv table or a DICOM waveform file"
         )
     elif path.suffix.lower() == ".csv":
-        ecg = _read_csv(path)
+        ecg = Ecg(*read_csv(path))
     else:
         ecg = _read_dicom(path)
     _require_usable(ecg, path, gaps)
@@ -116,6 +106,7 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
     try:
         _require_plain_units(header)
         with _quiet_wfdb() as wfdb:
+            _require_one_way_of_writing(wfdb, header)
             record = wfdb.rdrecord(str(header.with_suffix("").absolute()), return_res=64)
     except InputError:
         raise
@@ -138,134 +129,42 @@ def _require_plain_units(header: Path) -> None:
             )
 
 
+def _require_one_way_of_writing(wfdb: Any, header: Path) -> None:
+    """Refuse segments that the library would join wrongly, or not at all."""
+    whole = wfdb.rdheader(str(header.with_suffix("").absolute()))
+    names = getattr(whole, "seg_name", None) or []
+    if "~" in names and whole.layout == "fixed":
+        raise InputError(
+            f"{header}: has a gap between its segments (~), and no layout segment with which it "
+            "could be filled; write the record as one, with samples that are missing marked so, or "
+            "cut it at the gap"
+        )
+    own = [wfdb.rdheader(str(header.parent.absolute() / name)) for name in names if name != "~"]
+    # A variable layout's segments have some of its signals each.
+    units = [dict(zip(one.sig_name or [], one.units or [], strict=False)) for one in own]
+    told = {name: unit for one in units for name, unit in one.items()}
+    if any(one[name] != told[name] for one in units for name in one):
+        raise InputError(
+            f"{header}: its segments give one signal in different units, by which the library "
+            "would not scale them; write the record as one"
+        )
+
+
 def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:
     """The channels of a record in millivolts."""
     if record.p_signal is None or not record.n_sig:
         raise InputError(f"{header}: holds no signal; a WFDB record of an ECG is needed")
-    voltages = [k for k, unit in enumerate(record.units) if _is_voltage(unit)]
+    voltages = [k for k, unit in enumerate(record.units) if is_voltage(unit)]
     kept = voltages if gaps and voltages else list(range(record.n_sig))
-    factors = [_millivolts(record.units[k], str(header)) for k in kept]
+    factors = [millivolts(record.units[k], str(header)) for k in kept]
     signal_mv = np.asarray(record.p_signal, dtype=float)[:, kept] * factors
     # A header need not name its signals.
     names = tuple(record.sig_name[k] or f"signal {k + 1}" for k in kept)
     return Ecg(signal_mv, names, float(record.fs))
 
 
-def _read_csv(path: Path) -> Ecg:
-    """Read a table of times and millivolts."""
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").strip().splitlines()
-    names = [name.strip() for name in lines[0].split(",")] if lines else []
-    if len(names) < 2 or names[0] != "time_s":
-        raise InputError(
-            f"{path}: the first row is {names}; it needs time_s and then the name of each lead, "
-            f"separated by commas{_remedy(lines[0] if lines else '')}"
-        )
-    for name in names[1:]:
-        unit = UNIT_OF_LEAD.search(name)
-        if unit and _is_voltage(unit[1]) and _unit(unit[1]) != "mv":
-            raise InputError(
-                f"{path}: lead {name!r} is in {unit[1]}; a CSV file holds millivolts: write the "
-                "values so, and (mV) or nothing behind the name"
-            )
-    rows = [_csv_row(path, number, line, len(names)) for number, line in enumerate(lines[1:], 2)]
-    if len(rows) < 2:
-        raise InputError(f"{path}: has {len(rows)} rows of samples; it needs 2 or more")
-    table = np.array(rows)
-    step_s = _even_step_s(table[:, 0], path)
-    return Ecg(table[:, 1:], tuple(names[1:]), 1 / step_s, float(table[0, 0]))
-
-
-def _remedy(header: str) -> str:
-    """What to do about a first row that is no header of an ECG, where that can be told."""
-    if "\x00" in header:
-        return "; the text is UTF-16: save it as UTF-8"
-    if header.startswith("#"):
-        return "; delete the lines of comments above"
-    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
-        if mark in header:
-            return f", not by {word}: replace them, and first of all any decimal commas by points"
-    if header.lstrip('"').lower().startswith(("time", "t,", "t ", "t(", "t[")):
-        return "; call the first column time_s, without quotes, and let it hold seconds"
-    return ""
-
-
-def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
-    """The numbers of one line."""
-    cells = line.split(",")
-    try:
-        values = [float(cell) for cell in cells]
-    except ValueError:
-        values = []
-    if len(values) == columns and not any(map(math.isinf, values)) and math.isfinite(values[0]):
-        return values
-    remedy = "mend it, and delete no line: a gap in time is refused"
-    if len(cells) == columns and not all(cell.strip() for cell in cells[1:]):
-        remedy = "write nan where a sample is missing"
-    elif "." not in line and len(cells) == 2 * columns:
-        remedy = "decimal commas look like separators: write points"
-    raise InputError(
-        f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
-        f"{remedy}"
-    )
-
-
-def _even_step_s(times_s: Float, path: Path) -> float:
-    """Time between samples; each must lie within half a step of an even grid."""
-    steps_s = np.diff(times_s)
-    number = np.arange(len(times_s)) - (len(times_s) - 1) / 2
-    # Least squares: the ends alone would carry their own rounding into the rate.
-    even_s = float(number @ (times_s - times_s[0]) / (number @ number))
-    off_s = times_s - times_s.mean() - even_s * number
-    if not (steps_s > 0).all():
-        worst = int(np.argmin(steps_s > 0))
-        _refuse_jitter(off_s, even_s, steps_s, path)
-        mend = "take out the copy" if steps_s.min() == 0 else "sort the rows by time"
-        raise InputError(
-            f"{path}: time_s does not rise from {times_s[worst]} to {times_s[worst + 1]} s "
-            f"(line {worst + 3}); {mend}"
-        )
-    _require_seconds(even_s, path)
-    # Rounded times stay within half a step of the grid and no step doubles; a lost sample does it.
-    if np.ptp(off_s) > even_s or steps_s.max() > 1.75 * even_s:
-        _refuse_jitter(off_s, even_s, steps_s, path)
-        gap = int(np.argmax(steps_s))
-        raise InputError(
-            f"{path}: samples are not evenly spaced: {steps_s[gap]:.6g} s after {times_s[gap]} s "
-            f"(line {gap + 2}), where {even_s:.6g} s is the mean; fill the gap with rows whose "
-            "leads are nan, or cut the recording there"
-        )
-    return even_s
-
-
-def _refuse_jitter(off_s: Float, even_s: float, steps_s: Float, path: Path) -> None:
-    """Refuse times that scatter about an even grid: no row is missing or in another's place."""
-    # Of a gap, or of a few rows that changed places, nearly all steps are the usual one.
-    uneven = np.abs(steps_s - even_s) > 0.1 * even_s
-    # Times that stand still, but never run back, are of samples that were stamped in blocks.
-    near = np.abs(off_s).max() < _JITTER_STEPS * even_s or steps_s.min() == 0
-    if near and uneven.mean() > 0.5:
-        raise InputError(
-            f"{path}: time_s scatters by up to {1e3 * np.abs(off_s).max():.3g} ms about an even "
-            f"grid of {1e3 * even_s:.3g} ms, too much to tell which sample is which; no row is "
-            "missing: if the samples were taken evenly, write the time of the first plus the "
-            "number of the row over the sampling rate; if not, resample them"
-        )
-
-
-def _require_seconds(step_s: float, path: Path) -> None:
-    """Refuse times that are those of an ECG in another unit."""
-    for unit, count in (("milliseconds", 1e3), ("microseconds", 1e6)):
-        rate_hz = count / step_s
-        if _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
-            raise InputError(
-                f"{path}: time_s rises by {step_s:.6g} from row to row, which is "
-                f"{1 / step_s:.3g} samples a second; is it in {unit} ({rate_hz:.4g} samples a "
-                f"second)? it needs seconds: divide it by {count:.0f}"
-            )
-
-
 def _read_dicom(path: Path) -> Ecg:
-    """Read the longest group of channels of a DICOM waveform file."""
+    """Read the longest group of voltages in a DICOM waveform file."""
     import pydicom
 
     try:
@@ -277,9 +176,21 @@ def _read_dicom(path: Path) -> Ecg:
     groups = dataset.get("WaveformSequence")
     if not groups:
         raise InputError(f"{path}: DICOM without WaveformSequence; it needs an ECG waveform object")
-    # Resting ECGs carry the recording and, beside it, a short averaged beat.
-    lengths = [int(group.get("NumberOfWaveformSamples") or 0) for group in groups]
-    return _dicom_group(dataset, int(np.argmax(lengths)), path)
+    # Resting ECGs carry the recording and, beside it, a short averaged beat; monitors pressures.
+    longest = max(range(len(groups)), key=lambda index: _seconds(groups[index]))
+    return _dicom_group(dataset, longest, path)
+
+
+def _seconds(group: Any) -> tuple[bool, float]:
+    """Whether a multiplex group holds voltages alone, and how long it lasts."""
+    samples = float(group.get("NumberOfWaveformSamples") or 0)
+    rate_hz = float(group.get("SamplingFrequency") or 0)
+    coded = [
+        one.get("ChannelSensitivityUnitsSequence")
+        for one in group.get("ChannelDefinitionSequence") or []
+    ]
+    voltages = all(one and is_voltage(str(one[0].get("CodeValue", ""))) for one in coded)
+    return voltages, samples / rate_hz if rate_hz > 0 else samples
 
 
 def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
@@ -299,7 +210,7 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
             f"{path}: the waveform cannot be decoded ({error}); it needs complete samples, a "
             "sampling frequency, and a source and a unit for each channel; export it again"
         ) from error
-    scale = [_millivolts(unit, str(path)) for unit in units]
+    scale = [millivolts(unit, str(path)) for unit in units]
     patient = str(dataset.get("PatientID", "") or "").strip()
     return Ecg(signal * scale, names, rate_hz, patient=patient)
 
@@ -337,24 +248,6 @@ def _is_padding(dataset: Any, index: int) -> Mask:
 def _lead_name(channel: Any) -> str:
     """``II`` for a channel whose source is coded ``Lead II``."""
     return str(channel.ChannelSourceSequence[0].CodeMeaning).removeprefix("Lead ").strip()
-
-
-def _unit(unit: str) -> str:
-    return unit.strip().replace("µ", "u").replace("μ", "u").lower()
-
-
-def _is_voltage(unit: str) -> bool:
-    return _unit(unit) in MILLIVOLTS
-
-
-def _millivolts(unit: str, where: str) -> float:
-    """Millivolts in one ``unit``."""
-    if not _is_voltage(unit):
-        raise InputError(
-            f"{where}: a lead is in {unit!r}; it needs a voltage: V, mV, uV or nV (of a record "
-            "that was not calibrated, write mV: the scale of a lead changes no R peak)"
-        )
-    return MILLIVOLTS[_unit(unit)]
 
 
 def _require_usable(ecg: Ecg, path: Path, gaps: bool) -> None:
