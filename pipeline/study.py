@@ -25,6 +25,7 @@ from pipeline.study_folders import (
     found_ecg,
     found_us,
     require_names_of_folders,
+    require_no_other_record,
     require_no_other_sweep,
 )
 from pipeline.validation import Section, describe_validation
@@ -215,6 +216,8 @@ def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
         content[name] = _overridden(found, given[name]) if name in given else found
     if content["ecg"] is None:
         content["ecg"] = {}
+    if "ecg" not in given:
+        require_no_other_record(folder / "ecg", content["ecg"])
     if "us" not in given:
         require_no_other_sweep(folder / "us", content["us"])
     require_names_of_folders(folder, given)

@@ -128,6 +128,23 @@ def require_no_other_sweep(us: Path, found: dict[str, Any] | None) -> None:
             )
 
 
+def require_no_other_record(ecg: Path, found: dict[str, Any]) -> None:
+    """Refuse a file that a user took for the record made with the cine, and that nothing would
+    read; that ultrasound needs its own is told elsewhere.
+
+    Raises
+    ------
+    InputError
+        When the folder ``ecg`` holds such a file beside the section ``found``.
+    """
+    unread = [] if found["mr"] else sorted(ecg.glob("mr.*"))
+    if unread:
+        raise InputError(
+            f"{unread[0]}: would not be read; convert it to WFDB (mr.hea with its data), CSV or "
+            "DICOM, take it out, or write `ecg: {mr: null}` into study.yaml"
+        )
+
+
 def _record(stem: Path) -> Path | None:
     if stem.with_suffix(".hea").exists():
         return stem

@@ -15,6 +15,7 @@ from cine_files import (
     ORIGIN_MM,
     PHASES,
     PIXEL_MM,
+    ROW_AXIS,
     ROWS,
     RR_MS,
     SLICES,
@@ -442,3 +443,101 @@ def test_slices_of_two_examinations_are_told(tmp_path: Path) -> None:
 
     write_dicom(tmp_path, change)
     assert "different StudyInstanceUIDs" in read_dicom_cine(tmp_path).remarks[0]
+
+
+def test_two_acquisitions_in_one_series_are_not_mixed(tmp_path: Path) -> None:
+    """Times differ by a trifle, as RR intervals do: nothing else would part them."""
+
+    def numbered(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "short axis").AcquisitionNumber = 1
+        return True
+
+    write_dicom(tmp_path, numbered)
+    for k, (number, phase) in enumerate(ALL_FRAMES):
+        data = in_series(dicom_frame(number, phase), 1, "short axis")
+        data.TriggerTime, data.AcquisitionNumber = phase * RR_MS / PHASES + 2, 2
+        data.PixelData = (data.pixel_array + 3).tobytes()
+        data.save_as(tmp_path / f"again_{k}.dcm")
+    words = r'slice 0 is given twice: by series 1 "short axis", acquisition 1, .*, and by series 1 '
+    with pytest.raises(InputError, match=words + r".*take the other's files out$"):
+        read_dicom_cine(tmp_path)
+
+
+@pytest.mark.parametrize("aside_mm", [0.05, 6.0])
+def test_phases_of_a_slice_lie_in_one_place(tmp_path: Path, aside_mm: float) -> None:
+    def later_aside(data: FileDataset, number: int, phase: int) -> bool:
+        if number == 2 and phase > 2:
+            place_mm = np.array(data.ImagePositionPatient, float) + aside_mm * ROW_AXIS
+            data.ImagePositionPatient = place_mm.tolist()
+        return True
+
+    write_dicom(tmp_path, later_aside)
+    if aside_mm < 0.1:
+        assert_is_the_stack(read_dicom_cine(tmp_path))
+    else:
+        with pytest.raises(InputError, match=r"phases of slice 2 lie in .*6\.00 mm"):
+            read_dicom_cine(tmp_path)
+
+
+def test_a_cine_that_tells_its_beat_goes_before_images_in_real_time_that_do_not(
+    tmp_path: Path,
+) -> None:
+    """They are more, and last no longer than a slow heart's beat."""
+    beats = coarser(series([*range(SLICES)], [100.0 * k for k in range(4 * PHASES)]))
+    for data in beats:
+        del data.NominalInterval
+    assert_is_the_stack(read_dicom_cine(beside_the_stack(tmp_path, beats)))
+
+
+def of_ge(part: int) -> Callable[[FileDataset], None]:
+    def change(data: FileDataset) -> None:
+        data.private_block(0x0043, "GEMS_PARM_01", create=True).add_new(0x2F, "SS", part)
+
+    return change
+
+
+def of_type(*values: str) -> Callable[[FileDataset], None]:
+    def change(data: FileDataset) -> None:
+        data.ImageType = ["ORIGINAL", "PRIMARY", *values]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [of_ge(1), of_ge(3), of_type("R_FFE", "R"), of_type("I_FFE", "I"), of_type("PHASE MAP", "P")],
+)
+def test_parts_of_complex_images_in_the_cines_own_series_are_left_out(
+    tmp_path: Path, change: Callable[[FileDataset], None]
+) -> None:
+    others = [dicom_frame(*which) for which in ALL_FRAMES]
+    for data in others:
+        data.PixelData = (data.pixel_array + 500).tobytes()
+        change(data)
+    write_dicom(tmp_path, lambda data, number, phase: bool(in_series(data, 1, "cine")))
+    for k, data in enumerate(others):
+        in_series(data, 1, "cine").save_as(tmp_path / f"other_{k}.dcm")
+    stack = read_dicom_cine(tmp_path)
+    assert_is_the_stack(stack)
+    assert f"{len(others)} images" in stack.left_out[0]
+
+
+@pytest.mark.parametrize(("rate", "told"), [(75, False), (60, False), (40, True), (150, True)])
+def test_a_heart_rate_that_contradicts_the_interval_is_told(
+    tmp_path: Path, rate: int, told: bool
+) -> None:
+    def rated(data: FileDataset, number: int, phase: int) -> bool:
+        data.HeartRate = rate
+        return True
+
+    write_dicom(tmp_path, rated)
+    stack = read_dicom_cine(tmp_path)
+    assert stack.cine.rr_s == RR_MS / 1000
+    assert [one for one in stack.remarks if "HeartRate" in one] == list(stack.remarks)
+    assert len(stack.remarks) == told
+
+
+def test_a_finer_stack_that_was_not_taken_is_told(tmp_path: Path) -> None:
+    more = coarser(series([*range(SLICES)], [60.0 * k for k in range(2 * PHASES)]))
+    (remark,) = read_dicom_cine(beside_the_stack(tmp_path, more)).remarks
+    assert "a cine of 4 slices in the same direction, and of finer pixels than series 9" in remark

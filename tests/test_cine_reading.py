@@ -315,6 +315,21 @@ def test_voxels_that_lost_their_size_are_told(tmp_path: Path) -> None:
         assert read_nifti_cine(path, None, 800).remarks == ()
 
 
+@pytest.mark.parametrize(("repetition_s", "told"), [(0.16, True), (0.003, False), (None, False)])
+def test_a_time_step_that_is_the_repetition_time_is_told(
+    tmp_path: Path, repetition_s: float | None, told: bool
+) -> None:
+    """As converters write it, of segmented cines too."""
+    path = tmp_path / "cine.nii"
+    nifti_cine(path, np.diag([1.4, 1.4, 8, 1]))
+    said = {} if repetition_s is None else {"RepetitionTime": repetition_s}
+    (tmp_path / "cine.json").write_text(json.dumps(said))
+    assert [
+        ("repetition time of cine.json" in one) for one in read_nifti_cine(path, None).remarks
+    ] == ([True] * told)
+    assert read_nifti_cine(path, None, 800).remarks == ()
+
+
 def test_a_header_that_places_the_images_nowhere_is_told(tmp_path: Path) -> None:
     (remark,) = placed(tmp_path, 0, 0)
     assert "places the images nowhere" in remark

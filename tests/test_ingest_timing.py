@@ -81,3 +81,17 @@ def test_an_ecg_of_another_heart_rate_is_told(tmp_path: Path) -> None:
     [told] = remarks_of(tmp_path, 1100.0, 0.8)
     assert told.startswith("the cine's RR interval is 1100 ms, that of ")
     assert "ms: either timing is wrong, or the ECG is of another" in told
+
+
+def test_phases_in_pairs_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of two acquisitions that no attribute tells apart."""
+    read_cine = ingest.read_nifti_cine
+
+    def paired(*given: Any) -> Any:
+        stack = read_cine(*given)
+        phases = (np.arange(PHASES) // 2 + 0.02 * (np.arange(PHASES) % 2)) / (PHASES // 2)
+        return replace(stack, cine=replace(stack.cine, phases=phases))
+
+    monkeypatch.setattr(ingest, "read_nifti_cine", paired)
+    [told] = remarks_of(tmp_path, 800.0, None)
+    assert told.startswith("phases come in pairs, 0.004 of a beat apart")

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from cine_files import COLUMNS, PHASES, ROWS, RR_MS, dicom_frame, in_series, write_dicom
+from cine_files import (
+    COLUMNS,
+    PHASES,
+    ROWS,
+    RR_MS,
+    dicom_frame,
+    in_series,
+    pixel_value,
+    write_dicom,
+)
 from pydicom import dcmread
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
@@ -98,6 +107,18 @@ def test_a_cine_across_the_stack_that_is_no_view_is_told_with_the_reason(
     stack, views = read_dicom_study(tmp_path)
     assert views == ()
     assert stack.left_out[-1].startswith(f'series 50 "view 0": no long-axis view: {words}')
+
+
+def test_a_series_of_two_images_at_each_time_is_no_view(tmp_path: Path) -> None:
+    """As of flow, where nothing tells magnitude from velocity."""
+    write_dicom(tmp_path)
+    add_view(tmp_path, 0)
+    add_view(tmp_path, 1, PixelData=pixel_value(7, 3).tobytes(), SeriesInstanceUID="1.2.3.50",
+             SeriesNumber=50, SeriesDescription="view 0")  # fmt: skip
+    stack, views = read_dicom_study(tmp_path)
+    assert views == ()
+    reason = 'series 50 "view 0": no long-axis view: it shows two images at 0 ms'
+    assert stack.left_out[-1] == reason
 
 
 def test_a_view_is_timed_by_what_tells_its_images_apart(tmp_path: Path) -> None:

@@ -91,6 +91,19 @@ def test_study_yaml_overrides_only_the_keys_it_gives(tmp_path: Path) -> None:
     assert open_study(folder).ecg.us == folder / "ecg" / "us"
 
 
+@pytest.mark.parametrize("name", ["mr.edf", "mr.dat"])
+def test_a_record_of_a_kind_that_is_not_read_is_refused(tmp_path: Path, name: str) -> None:
+    folder = study_folder(tmp_path)
+    for one in (folder / "ecg").glob("mr.*"):
+        one.unlink()
+    assert open_study(folder).ecg.mr is None
+    (folder / "ecg" / name).write_text("x")
+    with pytest.raises(InputError, match=rf"{name}: would not be read; convert it to WFDB"):
+        open_study(folder)
+    (folder / "study.yaml").write_text("ecg: {mr: null}\n")
+    assert open_study(folder).ecg.mr is None
+
+
 def test_null_takes_out_what_the_folders_hold(tmp_path: Path) -> None:
     folder = study_folder(tmp_path)
     (folder / "study.yaml").write_text("us: null\necg: {mr: null}\n")

@@ -197,6 +197,18 @@ def test_a_pose_of_zeros_is_none(tmp_path):
     assert remarks_on([sweep]) == [f"s: {sweep.remarks[0]}"]
 
 
+def test_the_identity_is_no_pose_but_of_a_probe_that_rests_there(tmp_path):
+    """As some recorders write for a tool unseen; a pose that was measured is never exact."""
+    place = "Seq_Frame{:04d}_ProbeToTrackerTransform"
+    fields = good_fields() | {place.format(k): text(np.eye(4)) for k in (1, 2)}
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    np.testing.assert_array_equal(sweep.numbers, [0, 3, 4])
+    assert sweep.remarks == ("2 of 5 frames left out, which have no valid picture or pose",)
+    fields |= {place.format(k): text(np.eye(4)) for k in range(FRAMES)}
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    assert len(sweep.numbers) == FRAMES
+
+
 def test_rows_of_frames_are_numbered_as_in_the_file(tmp_path):
     fields = good_fields() | {"Seq_Frame0001_ImageStatus": "INVALID"}
     sweeps = read_sweeps(files(write(tmp_path / "s.mha", fields)))

@@ -52,6 +52,14 @@ def test_an_orientation_that_is_none_is_refused(tmp_path):
         read_sweep(write(tmp_path / "s.mha", fields))
 
 
+def test_what_is_no_picture_as_it_is_shown_is_refused(tmp_path):
+    fields = good_fields() | {"UltrasoundImageType": "BRIGHTNESS"}
+    assert read_sweep(write(tmp_path / "s.mha", fields)).remarks == ()
+    fields["UltrasoundImageType"] = "RF_REAL"
+    with pytest.raises(InputError, match="UltrasoundImageType is RF_REAL; it needs the brightness"):
+        read_sweep(write(tmp_path / "s.mha", fields))
+
+
 def test_compressed_pixels_of_unknown_length_are_refused(tmp_path):
     """The library would show them black."""
     path = write(tmp_path / "s.mha", good_fields(), compress=True)
@@ -81,7 +89,7 @@ def test_invalid_frames_are_left_out_and_counted(tmp_path, status):
     fields["Seq_Frame0001_ProbeToTrackerTransform"] = text(np.full((4, 4), np.nan))
     fields["Seq_Frame0001_Timestamp"] = "nan"
     sweep = read_sweep(write(tmp_path / "s.mha", fields))
-    assert sweep.remarks == ("1 of 5 frames left out, which the tracker marked as not valid",)
+    assert sweep.remarks == ("1 of 5 frames left out, which have no valid picture or pose",)
     np.testing.assert_array_equal(sweep.numbers, [0, 2, 3, 4])
     np.testing.assert_array_equal(sweep.images, PIXELS[[0, 2, 3, 4]])
     np.testing.assert_allclose(sweep.times_s, 3.0 + 0.05 * np.array([0, 2, 3, 4]))

@@ -11,7 +11,6 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32
 from pipeline.imaging.frames import (
-    LEAST_OF_A_BEAT,
     LEAVE_OUT,
     MIN_PHASES,
     MIN_SLICES,
@@ -19,6 +18,7 @@ from pipeline.imaging.frames import (
     by_slice,
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
+from pipeline.imaging.phases import common_phases
 from pipeline.imaging.spacing import fill_gaps, regular_steps
 from pipeline.imaging.stack_choice import choose_stack, stacks_beside
 
@@ -26,8 +26,9 @@ EVENLY = (
     "give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
     "InstanceNumber where each image has one and none of a slice tells its time"
 )
-PLAUSIBLE_RR_S = (0.2, 3.0)
-"""300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
+OTHER_RATE = 1.3
+"""Times by which a heart may beat faster or slower than its images tell, by another of their
+attributes or by the ECG beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +133,11 @@ def stack_frames(
     intensity, missing = fill_gaps(_intensity(slices), numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
-    doubts = _doubts_of_place(chosen) + stacks_beside(frames, chosen, where)
+    doubts = (
+        *_doubts_of_place(chosen),
+        *_doubts_of_rate(chosen),
+        *stacks_beside(frames, chosen, where),
+    )
     patient = next((frame.patient for frame in chosen if frame.patient), "")
     timed = tuple(numbers.tolist()) if missing else ()
     return Stack(cine, triggers, rr_ms, source, lines, timed, doubts, patient)
@@ -160,75 +165,18 @@ def _doubts_of_place(frames: Sequence[Frame]) -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def common_phases(
-    trigger_times_ms: Float, rr_ms: Float, where: str, numbers: Sequence[int] | None = None
-) -> Float:
-    """One phase axis for all slices: trigger time over the slice's own RR interval.
-
-    Parameters
-    ----------
-    trigger_times_ms
-        ``(slice, phase)``.
-    rr_ms
-        ``(slice,)``.
-    numbers
-        ``(slice,)`` the slices' numbers in the stack, for messages; counted from 0 when left out.
-
-    Raises
-    ------
-    InputError
-        When an RR interval is implausible, a trigger time lies outside its heartbeat, all lie
-        within a small part of it, or of n phases those of a slice are over half an n-th of a cycle
-        away from the others'.
-    """
-    numbers = range(len(rr_ms)) if numbers is None else numbers
-    low_ms, high_ms = (1000 * limit for limit in PLAUSIBLE_RR_S)
-    if not ((rr_ms > low_ms) & (rr_ms < high_ms)).all():
-        worst = rr_ms[np.argmax(np.abs(np.log(np.maximum(rr_ms, 1e-6) / 900)))]
-        seconds = " it looks as if told in seconds;" if low_ms < 1000 * worst < high_ms else ""
-        raise InputError(
-            f"{where}: RR interval {worst:g} ms, a heartbeat lasts {low_ms:g} to {high_ms:g} ms;"
-            f"{seconds} correct the timing, or cine.rr_ms in study.yaml, which goes before it"
-        )
-    phases = trigger_times_ms / rr_ms[:, None]
-    if not np.isfinite(phases).all():
-        number, phase = np.argwhere(~np.isfinite(phases))[0]
-        raise InputError(
-            f"{where}: the trigger time of slice {numbers[number]}, phase {phase}, is "
-            f"{trigger_times_ms[number, phase]:g}; give a number of milliseconds"
-        )
-    outside = ((phases < 0) | (phases >= 1)).any(axis=1)
-    if outside.any():
-        number = int(outside.argmax())
-        raise InputError(
-            f"{where}: trigger times from {trigger_times_ms[number].min():g} to "
-            f"{trigger_times_ms[number].max():g} ms do not fit in an RR interval of "
-            f"{rr_ms[number]:g} ms (slice {numbers[number]}); correct them, or give cine.rr_ms "
-            "in study.yaml"
-        )
-    common = phases.mean(axis=0)
-    if (np.diff(common) <= 0).any():
-        raise InputError(
-            f"{where}: trigger times must rise from phase to phase, they are "
-            f"{trigger_times_ms.mean(axis=0).round(1).tolist()} ms (mean of the slices); put the "
-            "phases in the order of time"
-        )
-    if common[-1] - common[0] < LEAST_OF_A_BEAT:
-        raise InputError(
-            f"{where}: trigger times go from {trigger_times_ms.min():g} to "
-            f"{trigger_times_ms.max():g} ms, {common[-1] - common[0]:.2g} of an RR interval of "
-            f"{rr_ms.mean():g} ms; a beat's phases lie further apart: are both in milliseconds?"
-        )
-    away = np.abs(phases - common).max(axis=1)
-    if away.max() > 0.5 / phases.shape[1]:
-        raise InputError(
-            f"{where}: slice {numbers[int(away.argmax())]} lies {away.max():.3f} of a cycle off "
-            f"the other slices' phases; of {phases.shape[1]} phases those that are at most "
-            f"{0.5 / phases.shape[1]:.3f} off can be used; "
-            "all slices need the same phases; where times after the R peak are the same in all "
-            "slices and RR intervals differ, cine.rr_ms in study.yaml puts all on one"
-        )
-    return np.asarray(common)
+def _doubts_of_rate(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """A sentence where images tell two RR intervals, one by the heart rate."""
+    both = [(frame.rr_ms, frame.other_rr_ms) for frame in frames if frame.other_rr_ms]
+    if not both:
+        return ()
+    own_ms, other_ms = np.median(np.array(both, dtype=float), axis=0)
+    if 1 / OTHER_RATE <= own_ms / other_ms <= OTHER_RATE:
+        return ()
+    return (
+        f"the images' RR interval is {own_ms:.0f} ms, but by their HeartRate {other_ms:.0f} ms; "
+        "the first is taken: if it is not the length of a beat, give cine.rr_ms in study.yaml",
+    )
 
 
 def _require_timing(frames: Sequence[Frame]) -> None:
@@ -252,7 +200,8 @@ def _rr_ms(frame: Frame) -> float:
     if frame.rr_ms is None:
         raise InputError(
             f"{frame.where}: has no RR interval (NominalInterval (0018,1062) or HeartRate "
-            "(0018,1088)); give cine.rr_ms in study.yaml"
+            "(0018,1088)); give cine.rr_ms in study.yaml, or, if it is none of the cine, "
+            "leave its series out: cine.leave_out_series takes its number"
         )
     return frame.rr_ms
 
@@ -313,26 +262,36 @@ def _tie(ordered: Sequence[Frame], name: str) -> tuple[Frame, Frame] | None:
 
 
 def _require_given_once(slices: Sequence[Sequence[Frame]], name: str, where: str) -> None:
-    """Refuse a slice that two series show over the same part of the heartbeat."""
+    """Refuse a slice that two series, or two acquisitions of one, show over the same part of the
+    heartbeat."""
     for number, one in enumerate(slices):
-        by_series: dict[str, list[Frame]] = {}
+        together: dict[object, list[Frame]] = {}
         for frame in one:
-            by_series.setdefault(frame.series_uid, []).append(frame)
+            together.setdefault((frame.series_uid, frame.acquisition), []).append(frame)
         spans = sorted(
-            (found for found in by_series.values() if len(found) >= MIN_PHASES),
+            (found for found in together.values() if len(found) >= MIN_PHASES),
             key=lambda found: (found[0].times_ms[name], found[0].series),
         )
         for first, second in pairwise(spans):
             if second[0].times_ms[name] < first[-1].times_ms[name]:
                 raise InputError(
-                    f"{where}: slice {number} is given twice: by {first[0].series}, "
-                    f"{_images(first)}, and by {second[0].series}, {_images(second)}, which "
-                    f"show the same trigger time or overlap; keep one series a slice: {LEAVE_OUT}"
+                    f"{where}: slice {number} is given twice: by {_origin(first)}, and by "
+                    f"{_origin(second)}, which show the same trigger time or overlap; "
+                    f"{_keep_one(first[0], second[0])}"
                 )
 
 
-def _images(frames: Sequence[Frame]) -> str:
-    return describe([frame.where for frame in frames])
+def _origin(frames: Sequence[Frame]) -> str:
+    first = frames[0]
+    part = "" if first.acquisition is None else f", acquisition {first.acquisition}"
+    return f"{first.series}{part}, {describe([frame.where for frame in frames])}"
+
+
+def _keep_one(first: Frame, second: Frame) -> str:
+    """What to do about a slice that two sets of images show."""
+    if first.series == second.series:
+        return "keep one acquisition a slice: take the other's files out"
+    return f"keep one series a slice: {LEAVE_OUT}"
 
 
 def _intensity(slices: Sequence[Sequence[Frame]]) -> Float32:

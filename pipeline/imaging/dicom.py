@@ -46,7 +46,12 @@ TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
 """Where Legacy Converted Enhanced objects keep attributes without a functional group."""
 
-PHASE_IMAGES = {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"}
+OTHER_COMPONENTS = {
+    "phase": {"P", "PHASE", "PHASE MAP", "VELOCITY", "VELOCITY MAP"},
+    "real": {"R", "REAL"},
+    "imaginary": {"I", "IMAGINARY"},
+}
+"""What in ImageType tells that an image is no magnitude."""
 
 
 def read_dicom_study(
@@ -240,7 +245,8 @@ def _frame(
         )
     try:
         timing = group("CardiacSynchronizationSequence")
-        own_rr_ms = _rr_ms(timing, dataset) if rr_ms is None else rr_ms
+        told = _rr_ms(timing, dataset)
+        own_rr_ms = next(iter(told.values()), None) if rr_ms is None else rr_ms
         position_mm, directions, spacing_mm = _geometry(corner, axes, spacing)
         return Frame(
             where=where,
@@ -257,6 +263,8 @@ def _frame(
             patient=str(dataset.get("PatientID", "") or "").strip(),
             number=_number(dataset, group, place),
             study=str(dataset.get("StudyInstanceUID", "") or ""),
+            acquisition=_acquisition(dataset, group),
+            other_rr_ms=told.get("HeartRate") if rr_ms is None and len(told) > 1 else None,
         )
     except (ValueError, TypeError, IndexError) as error:
         raise _not_understood(where, error) from error
@@ -311,14 +319,16 @@ def _given(item: Any, name: str) -> bool:
     return item.get(name) not in (None, "")
 
 
-def _rr_ms(timing: Any, dataset: Any) -> float | None:
-    """By the attribute that tells it best, of the frame or, behind that, of its whole object."""
+def _rr_ms(timing: Any, dataset: Any) -> dict[str, float]:
+    """By each attribute that tells it, the best first, of the frame or, behind that, of its whole
+    object."""
     names = ("NominalInterval", "RRIntervalTimeNominal", "HeartRate", "CardiacRRIntervalSpecified")
+    told: dict[str, float] = {}
     for name, item in itertools.product(names, (timing, dataset)):
         if _given(item, name) and float(item.get(name)) > 0:
             value = float(item.get(name))
-            return 60000 / value if name == "HeartRate" else value
-    return None
+            told.setdefault(name, 60000 / value if name == "HeartRate" else value)
+    return told
 
 
 def _series_number(dataset: Any) -> int | None:
@@ -333,6 +343,11 @@ def _number(dataset: Any, group: Groups, place: int) -> int | None:
         return number
     in_time = whole_number(group("FrameContentSequence").get("TemporalPositionIndex"))
     return MOST_FRAMES * (number or 0) + (place if in_time is None else in_time)
+
+
+def _acquisition(dataset: Any, group: Groups) -> int | None:
+    own = group("FrameContentSequence").get("FrameAcquisitionNumber")
+    return whole_number(dataset.get("AcquisitionNumber") if own is None else own)
 
 
 def _series_name(dataset: Any) -> str:
@@ -350,6 +365,19 @@ def _kind(dataset: Any, frame_type: Any) -> str:
     component = frame_type.get("ComplexImageComponent") or dataset.get("ComplexImageComponent")
     if component not in (None, "", "MAGNITUDE"):
         return str(component).lower()
-    if PHASE_IMAGES & set(values[2:]):
-        return "phase"
+    if part := _component_of_ge(dataset):
+        return part
+    for name, words in OTHER_COMPONENTS.items():
+        if words & set(values[2:]):
+            return name
     return DERIVED if values[:1] == ["DERIVED"] else ORIGINAL
+
+
+def _component_of_ge(dataset: Any) -> str | None:
+    """What GE's scanners tell of an image that is no magnitude, in an attribute of their own."""
+    try:
+        value = dataset.get_private_item(0x0043, 0x2F, "GEMS_PARM_01").value
+    except KeyError:
+        return None
+    number = int.from_bytes(value[:2], "little") if isinstance(value, bytes) else value
+    return {1: "phase", 2: "real", 3: "imaginary"}.get(number)

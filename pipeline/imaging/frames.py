@@ -75,6 +75,12 @@ class Frame:
     number: int | None = None
     """Its number within its series; None when the file does not tell."""
 
+    acquisition: int | None = None
+    """Number of the acquisition within its series; None when the file does not tell."""
+
+    other_rr_ms: float | None = None
+    """RR interval by the heart rate, where another attribute tells ``rr_ms``."""
+
     @property
     def normal(self) -> Float:
         """Unit normal of the slice, right-handed."""

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, placement
+from pipeline.imaging.cine import Cine, placement
 from pipeline.imaging.frames import (
     LEAST_OF_A_BEAT,
     MIN_PHASES,
@@ -19,6 +19,7 @@ from pipeline.imaging.frames import (
     PARALLEL_COSINE,
     Frame,
 )
+from pipeline.imaging.phases import PLAUSIBLE_RR_S
 
 LEAST_ANGLE_DEG = 45.0
 """A long-axis view is turned at least this far from the stack's slices."""
@@ -144,7 +145,11 @@ def _view(frames: Sequence[Frame]) -> LongAxis | str | None:
         return "it has no trigger times"
     # The most trusted of those that tell most images apart, as for the stack.
     name = max(names, key=lambda one: len({frame.times_ms[one] for frame in frames}))
-    moments = {frame.times_ms[name]: frame for frame in reversed(frames)}
+    moments: dict[float, Frame] = {}
+    for frame in frames:
+        other = moments.setdefault(frame.times_ms[name], frame)
+        if not np.array_equal(other.pixels, frame.pixels):
+            return f"it shows two images at {frame.times_ms[name]:g} ms"
     if len(moments) < MIN_PHASES:
         return None
     ordered = [moments[time_ms] for time_ms in sorted(moments)]

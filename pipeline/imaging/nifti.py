@@ -19,11 +19,18 @@ from nibabel.openers import ImageOpener
 from nibabel.spatialimages import HeaderDataError
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Float32, corners_apart_mm
-from pipeline.imaging.cine import PLAUSIBLE_RR_S, Cine, Stack, common_phases
+from pipeline.geometry import Float
+from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
 from pipeline.imaging.limits import require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
+from pipeline.imaging.nifti_doubts import (
+    doubts_of_place,
+    doubts_of_size,
+    doubts_of_step,
+    doubts_of_values,
+)
+from pipeline.imaging.phases import PLAUSIBLE_RR_S, common_phases
 from pipeline.validation import find_truth
 
 # The library mends headers and tells people so, in words of its own; what matters of it is refused.
@@ -33,16 +40,11 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
 
-MOST_LABELS = 10
-"""No image of a scanner has so few grey values."""
 VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
 
-SAME_PLACE_MM = 0.5
-"""By which two placements of one stack may differ: less than a pixel."""
-
-LEAST_HEIGHT_MM = 60
-"""No stack of fewer millimetres holds a heart from tip to valves."""
+HEADER_STEP = "NIfTI time step"
+"""Where the RR interval comes from when nothing better tells it."""
 
 OBLONG = 4
 """With more slices than this times the columns or rows, the axes are in another order."""
@@ -143,9 +145,10 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         float(own_rr_ms.mean()) / 1000,
     )
     doubts = (
-        *_doubts_of_size(edges_mm, slice_count),
-        *_doubts_of_place(image),
-        *_doubts_of_values(cine.intensity[0]),
+        *doubts_of_size(edges_mm, slice_count),
+        *doubts_of_place(image),
+        *(doubts_of_step(_step_ms(image), _notes(path)) if source == HEADER_STEP else ()),
+        *doubts_of_values(cine.intensity[0]),
     )
     return Stack(cine, triggers, own_rr_ms, source, (), remarks=doubts)
 
@@ -181,6 +184,11 @@ def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis
 
 def _view_name(path: Path) -> str:
     return path.name.removesuffix(".gz").removesuffix(".nii")
+
+
+def _notes(path: Path) -> Path:
+    """What a converter may have written of the file, beside it."""
+    return path.with_name(f"{_view_name(path)}.json")
 
 
 def _view_timing(path: Path) -> Path:
@@ -268,49 +276,6 @@ def _right_angled_affine(image: Any, path: Path) -> Float:
     return affine
 
 
-def _doubts_of_size(edges_mm: Float, slices: int) -> tuple[str, ...]:
-    """What speaks against the size of the voxels, in words: cubes of 1 mm are what arrays become
-    that are saved without a header."""
-    if slices >= LEAST_HEIGHT_MM or not np.allclose(edges_mm, 1, atol=1e-6):
-        return ()
-    return (
-        f"the NIfTI header tells of voxels of 1 x 1 x 1 mm, so of a heart in {slices} mm, as "
-        "programs do that save an array alone; pixels of a cine are 1 to 2 mm wide, and its slices "
-        "5 to 10 mm apart: if so here, write the affine of the images that these were made of",
-    )
-
-
-def _doubts_of_values(phase: Float32) -> tuple[str, ...]:
-    """What speaks against the images of one phase ``(z, y, x)`` being images, in words."""
-    values = np.unique(phase)
-    few = 1 < len(values) <= MOST_LABELS
-    if not few or not np.equal(np.mod(values, 1), 0).all():
-        return ()
-    held = ", ".join(f"{value:g}" for value in values)
-    return (f"its voxels hold {held} alone, as a map of labels does: is it the cine?",)
-
-
-def _doubts_of_place(image: Any) -> tuple[str, ...]:
-    """What the header's two placements leave open, in words."""
-    by_sform, sform = image.get_sform(coded=True)
-    by_qform, qform = image.get_qform(coded=True)
-    if sform == 0 and qform == 0:
-        return (
-            "the NIfTI header places the images nowhere (its sform and qform codes are 0); they "
-            "are taken to lie about the origin, so a tracker's or planner's own coordinates do "
-            "not fit the field",
-        )
-    if sform == 0 or qform == 0:
-        return ()
-    off_mm = corners_apart_mm(by_sform, by_qform, image.shape[:3])
-    if off_mm <= SAME_PLACE_MM:
-        return ()
-    return (
-        f"the NIfTI header's sform and qform place the images up to {off_mm:.1f} mm apart; the "
-        "sform is taken, and other programs may take the other",
-    )
-
-
 def _timing(
     image: Any, path: Path, timing: Path | None, rr_ms: float | None
 ) -> tuple[Float, Float, str]:
@@ -323,16 +288,21 @@ def _timing(
         return triggers, np.full(slices, rr_ms), "study.yaml"
     source = "study.yaml"
     if rr_ms is None:
-        rr_ms, source = _header_rr_ms(image, path, phases), "NIfTI time step"
+        rr_ms, source = _header_rr_ms(image, path, phases), HEADER_STEP
     triggers = np.tile(rr_ms / phases * np.arange(phases), (slices, 1))
     return triggers, np.full(slices, rr_ms), source
+
+
+def _step_ms(image: Any) -> float:
+    unit = image.header.get_xyzt_units()[1]
+    return 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
 
 
 def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
     """One heartbeat of evenly spread phases, as the header's time step tells it."""
     unit = image.header.get_xyzt_units()[1]
     step = float(image.header.get_zooms()[3])
-    step_ms = 1000 * step * SECONDS_PER_UNIT.get(unit, 0.0)
+    step_ms = _step_ms(image)
     if not step_ms > 0:
         told = "without a unit" if unit == "unknown" else f"in {unit}"
         in_header = f"a time step of {step:g} {told} in" if step > 0 else "no time step in"

@@ -53,6 +53,7 @@ def regular_steps(
     away_mm = positions_mm - positions_mm[0] - numbers[:, None] * step_mm
     off_mm = np.linalg.norm(away_mm, axis=1)
     allowed_mm = max(0.1, 0.02 * usual_mm)
+    _require_one_place(slices, allowed_mm, where)
     if off_mm.max() > allowed_mm:
         worst = int(off_mm.argmax())
         along_mm = abs(float(away_mm[worst] @ slices[0][0].normal))
@@ -89,6 +90,20 @@ def regular_steps(
             f"{usual_mm:.2f} mm apart{remedy}"
         )
     return np.asarray(upright_mm), np.asarray(numbers, np.int64)
+
+
+def _require_one_place(slices: Sequence[Sequence[Frame]], allowed_mm: float, where: str) -> None:
+    """Refuse phases of a slice that lie beside one another: one place is taken for all."""
+    for number, one in enumerate(slices):
+        places_mm = np.array([frame.position_mm for frame in one])
+        off_mm = np.linalg.norm(places_mm - places_mm[0], axis=1)
+        if off_mm.max() > allowed_mm:
+            other = one[int(off_mm.argmax())]
+            raise InputError(
+                f"{where}: phases of slice {number} lie in different places: {other.where} "
+                f"{off_mm.max():.2f} mm from {one[0].where}, {allowed_mm:.2f} mm are allowed; all "
+                "phases of a slice need one place: keep those of one"
+            )
 
 
 def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, where: str) -> None:

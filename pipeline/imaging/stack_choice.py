@@ -37,9 +37,10 @@ from pipeline.imaging.frames import (
 )
 from pipeline.imaging.left_out import LeftOut, inside
 
-Rank = tuple[bool, int, bool, bool, int, float]
+Rank = tuple[bool, int, bool, bool, bool, int, float]
 """Whether a set is a cine stack, the images of the largest one in its direction, whether it shows
-one beat, whether original, its own number of images, pixels per mm2."""
+one beat, whether it tells how long one lasts, whether original, its own number of images, pixels
+per mm2."""
 
 
 def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list[LeftOut]]:
@@ -77,16 +78,28 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
 
 
 def stacks_beside(frames: Sequence[Frame], stack: Sequence[Frame], folder: str) -> tuple[str, ...]:
-    """Which other original images would make up a cine stack of another direction, in words."""
+    """Which other original images would make up a cine stack, in words: those of another direction,
+    and those of finer pixels."""
     others = [one for one in sets_alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
-    return tuple(
+    finer = [
+        f"{one[0].series} ({inside(one[0].where, folder)}, ...) is a cine of "
+        f"{len(slice_positions(one))} slices in the same direction, and of finer pixels than "
+        f"{stack[0].series}, which was taken for its {len(stack)} images: if that is the better "
+        "one, name the other's number in cine.leave_out_series in study.yaml"
+        for one in others
+        if are_parallel(stack[0], one[0])
+        and are_in_one_beat(one)
+        and one[0].spacing_mm[0] < 0.99 * stack[0].spacing_mm[0]
+    ]
+    across = [
         f"{one[0].series} ({inside(one[0].where, folder)}, ...) is a cine of "
         f"{len(slice_positions(one))} slices too, in another direction than {stack[0].series}, "
         f"which was taken for its {len(stack)} images: if that is not the short axis, take its "
         "files out, or name its number in cine.leave_out_series in study.yaml"
         for one in others
         if not are_parallel(stack[0], one[0])
-    )
+    ]
+    return (*across, *finer)
 
 
 def _without_copies(frames: Sequence[Frame]) -> tuple[list[Frame], list[LeftOut]]:
@@ -126,7 +139,9 @@ def _ranked(sets: Sequence[list[Frame]]) -> list[tuple[Rank, list[Frame]]]:
         per_mm2 = 1 / (one[0].spacing_mm[0] * one[0].spacing_mm[1])
         enough = any(one is other for other in stacks)
         original = one[0].kind == ORIGINAL
-        rank = (enough, max(along, default=0), are_in_one_beat(one), original, len(one), per_mm2)
+        told = any(frame.rr_ms is not None for frame in one)
+        in_direction = max(along, default=0)
+        rank = (enough, in_direction, are_in_one_beat(one), told, original, len(one), per_mm2)
         ranked.append((rank, one))
     return sorted(ranked, key=itemgetter(0), reverse=True)
 
@@ -139,9 +154,9 @@ def _weight(frames: Sequence[Frame]) -> int:
 def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str) -> None:
     rank, (first, *_) = ranked[0]
     for other_rank, (other, *_) in ranked[1:]:
-        if rank[0] and other_rank[:5] == rank[:5] and not are_parallel(first, other):
+        if rank[0] and other_rank[:6] == rank[:6] and not are_parallel(first, other):
             raise InputError(
-                f"{where}: holds two stacks of {rank[4]} images in different directions, "
+                f"{where}: holds two stacks of {rank[5]} images in different directions, "
                 f"{first.series} ({first.where}) and {other.series} ({other.where}); "
                 f"keep the one to be used: {LEAVE_OUT}"
             )

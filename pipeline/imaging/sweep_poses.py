@@ -48,16 +48,23 @@ def frame_of_poses(frames: Sequence[Fields], asked: str | None) -> str:
     return REFERENCE if followed and not told else TRACKER
 
 
-def is_tracked(fields: Fields, frame: str, with_calibration: bool) -> bool:
+def rests_at_origin(frames: Sequence[Fields], frame: str) -> bool:
+    """Whether the probe is where the frame of its poses begins, to the last bit, throughout."""
+    return all(_is_identity(fields.get(_name(*_chain(fields, frame)[0]), "")) for fields in frames)
+
+
+def is_tracked(fields: Fields, frame: str, with_calibration: bool, at_origin: bool = False) -> bool:
     """Whether the picture and all transforms of its pose are valid, that of its pixels included.
 
-    A matrix of zeros is no pose: some recorders write it, without a status, for a tool unseen.
+    A matrix of zeros is no pose: some recorders write it, without a status, for a tool unseen; and
+    others the identity, which is none where the probe does not rest ``at_origin`` throughout.
     """
     chain = [*([("Image", "Probe")] if with_calibration else []), *_chain(fields, frame)]
     names = ["ImageStatus", *(f"{_name(*link)}Status" for link in chain)]
     marked = any(fields.get(name, "OK").upper() != "OK" for name in names)
     blank = any(_is_blank(fields.get(_name(*link), "")) for link in chain)
-    return not (marked or blank)
+    unseen = not at_origin and _is_identity(fields.get(_name(*_chain(fields, frame)[0]), ""))
+    return not (marked or blank or unseen)
 
 
 def probe_pose(fields: Fields, frame: str, where: str) -> Float:
@@ -194,3 +201,8 @@ def _numbers(text: str) -> Float | None:
 def _is_blank(text: str) -> bool:
     matrix = _numbers(text)
     return matrix is not None and not matrix[:3].any()
+
+
+def _is_identity(text: str) -> bool:
+    matrix = _numbers(text)
+    return matrix is not None and np.array_equal(matrix, np.eye(4))

@@ -22,6 +22,7 @@ from pipeline.imaging.sweep_poses import (
     probe_pose,
     reference_pose,
     require_resting,
+    rests_at_origin,
 )
 
 if TYPE_CHECKING:
@@ -134,7 +135,8 @@ def read_sweep(
     frames = _frame_fields(path, header, len(images))
     frame = frame_of_poses(frames, pose_frame)
     own = probe_from_image is None
-    valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own)]
+    at_origin = rests_at_origin(frames, frame)
+    valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own, at_origin)]
     if not valid:
         raise InputError(
             f"{path}: none of its {len(frames)} frames has status OK; the probe was out of the "
@@ -163,7 +165,7 @@ def read_sweep(
 def _left_out(missing: int, frames: int) -> list[str]:
     if not missing:
         return []
-    return [f"{missing} of {frames} frames left out, which the tracker marked as not valid"]
+    return [f"{missing} of {frames} frames left out, which have no valid picture or pose"]
 
 
 def remarks_on(sweeps: Sequence[Sweep]) -> list[str]:
@@ -210,6 +212,12 @@ def _as_scanned(path: Path, images: Any, header: Fields) -> tuple[Any, tuple[str
 
     ImageToProbe belongs to pictures in this order, to which PLUS turns others when it reads them.
     """
+    kind = header.get("UltrasoundImageType", "").upper()
+    if kind not in ("", "BRIGHTNESS", "UNKNOWN", "XX"):
+        raise InputError(
+            f"{path}: UltrasoundImageType is {kind}; it needs the brightness that a scanner shows "
+            "(BRIGHTNESS): record, or convert it to, B-mode pictures"
+        )
     orientation = header.get("UltrasoundImageOrientation", "MF").upper()
     if not re.fullmatch("[MU][FN][AD]?|XX|", orientation):
         raise InputError(

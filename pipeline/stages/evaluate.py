@@ -19,7 +19,7 @@ from pipeline.evaluation.metrics import (
 from pipeline.evaluation.motion import motion_error
 from pipeline.geometry import Label, MovingSurface, Surface, corners_apart_mm
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.nifti import SAME_PLACE_MM
+from pipeline.imaging.nifti_doubts import SAME_PLACE_MM
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
 from pipeline.products import read_frames, read_labels, read_surfaces, read_table, write_table

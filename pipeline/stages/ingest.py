@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.imaging.cine import Stack
+from pipeline.imaging.cine import OTHER_RATE, Stack
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import Ecg, other_patient, patient_mark, read_ecg
 from pipeline.imaging.faults import (
@@ -22,12 +22,11 @@ from pipeline.job import Job
 from pipeline.products import write_cine
 from pipeline.registration.time import detect_r_peaks, median_rr_s
 
+PAIRED, LEAST_PAIRED = 0.2, 8
+"""A step of less than this share of the mean one is none of a cine of so many phases."""
 WIDEST_STEP, MOST_STEPS = 0.25, 3.0
 """Share of a beat between two phases, and times the usual step, beyond which it is told: gating
 that waits for the next R peak leaves out a fifth at the end."""
-
-OTHER_RATE = 1.3
-"""Times by which a heart may beat faster or slower in the ECG of the MR than in its images."""
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -85,6 +84,11 @@ def _doubts_of_beat(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
             f"no image shows the {steps[widest]:.0%} of the heartbeat after phase "
             f"{phases[widest]:.2f}, and the motion there is a guess: is the RR interval of "
             f"{1000 * rr_s:.0f} ms right? Times after the R peak are to be those of such a beat"
+        )
+    if len(steps) >= LEAST_PAIRED and (steps < PAIRED * steps.mean()).mean() > 1 / 3:
+        doubts.append(
+            f"phases come in pairs, {steps.min():.2g} of a beat apart, as where slices were taken "
+            "twice and both were mixed: keep one acquisition"
         )
     if ecg is None:
         return doubts
