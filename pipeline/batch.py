@@ -215,7 +215,7 @@ class _Running:
         # What cannot be written now may be later; only the last time counts.
         write_csv(self._out / TABLE, rows(self._ended))
         total = sum(plan.is_study for plan in self._plans)
-        done = len(self._ended) - (len(self._plans) - total)
+        done = sum(other.outcome.status != NO_STUDY for other in self._ended)
         self._watcher.ended(one.outcome, done, total)
 
     def _run_one(self, plan: Plan) -> Ended:

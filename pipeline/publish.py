@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
+from glob import escape
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,9 @@ def publishing(target: Path) -> Iterator[Path]:
     with readable_write_errors(target):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            _remove_orphans(target)
+            # What is another user's is theirs to clear away.
+            with suppress(OSError):
+                remove_partials(target.parent, target.name)
             remove(partial)
             partial.mkdir()
             yield partial
@@ -114,12 +117,12 @@ def readable_write_errors(target: Path) -> Iterator[None]:
 def _swap(partial: Path, target: Path) -> None:
     """Put ``partial`` in the place of ``target``; a folder cannot be renamed over another."""
     old = target.with_name(f".{target.name}{PARTIAL}old-{os.getpid()}")
-    if target.exists():
-        target.rename(old)
     try:
+        if target.exists():
+            target.rename(old)
         partial.rename(target)
-    except OSError:
-        if old.exists():
+    except BaseException:
+        if old.exists() and not target.exists():
             old.rename(target)
         raise
     remove(old)
@@ -133,17 +136,6 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _remove_orphans(target: Path) -> None:
-    """Clear away what killed processes left unfinished of one target."""
-    start = f".{target.name}{PARTIAL}"
-    # What is another user's is theirs to clear away.
-    with suppress(OSError):
-        for path in target.parent.iterdir():
-            pid = path.name.removeprefix(start)
-            if path.name.startswith(start) and pid.isdecimal() and not _lives(int(pid)):
-                remove(path)
-
-
 def _lives(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -154,10 +146,12 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def remove_partials(folder: Path) -> None:
-    """Clear away what a killed run left unfinished."""
-    for path in folder.glob(f".*{PARTIAL}*"):
-        remove(path)
+def remove_partials(folder: Path, name: str = "*") -> None:
+    """Clear away what killed runs left unfinished, of one product or of all."""
+    for path in folder.glob(f".{name if name == '*' else escape(name)}{PARTIAL}*"):
+        pid = path.name.rpartition("-")[2]
+        if not (pid.isdecimal() and _lives(int(pid))):
+            remove(path)
 
 
 @contextmanager

@@ -172,14 +172,11 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
         run.watcher.ended(stage.name, f"skipped: {reason}", 0.0)
         run.stages[stage.name] = {"status": "skipped", "cause": str(reason), "fingerprint": key}
         return
-    except BeatfieldError as error:
+    except Exception as error:
         _fail(run, stage, error, time.perf_counter() - clock)
         # What finished stages noticed may be why this one failed.
-        for word, text in remarks(run.stages):
+        for word, text in remarks(run.stages) if isinstance(error, BeatfieldError) else ():
             error.add_note(f"{word}: {text}")
-        raise
-    except OSError as error:
-        _fail(run, stage, error, time.perf_counter() - clock)
         raise
     seconds = time.perf_counter() - clock
     measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}

@@ -6,6 +6,7 @@ elsewhere, key by key. Nothing here reads an image.
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -148,8 +149,15 @@ def open_study(folder: Path) -> Study:
     described = folder / "study.yaml"
     require_no_device(described)
     given = _read_yaml(described) if described.exists() else {}
-    study = _understood(folder, given, str(described if given else folder))
-    _require_files(study)
+    try:
+        study = _understood(folder, given, str(described if given else folder))
+        _require_files(study)
+    except (ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENAMETOOLONG:
+            raise
+        raise InputError(
+            f"{described}: names a place that cannot be looked at ({error}); correct it"
+        ) from error
     return study
 
 

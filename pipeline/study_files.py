@@ -42,6 +42,7 @@ def files_below(path: Path) -> list[Path]:
             folders.clear()
             continue
         entered.add(place)
+        folders[:] = [one for one in folders if not is_litter(one)]
         found += [Path(name, one) for one in files if not is_litter(one)]
     for one in found:
         if one.is_symlink() and not one.exists():

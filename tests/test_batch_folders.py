@@ -6,6 +6,7 @@ A program stands in for the pipeline's own process.
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -80,6 +81,20 @@ def test_studies_of_one_patient_fail_and_the_others_are_run(studies: Path, other
     }
     assert f"has the patient id '{other}' of {studies / 'good'}" in rows["also"]["cause"]
     assert f"of {studies / 'also'}; give each study" in rows["good"]["cause"]
+
+
+@pytest.mark.parametrize("others", [1, 3])
+def test_progress_counts_studies_whatever_else_is_refused_or_none(
+    studies: Path, capsys: pytest.CaptureFixture[str], others: int
+) -> None:
+    """Refused ones end first, and folders that are no study are none."""
+    make_study(studies / "also", "patient_id: good\n")
+    for number in range(others):
+        (studies / f"zz{number}").mkdir()
+    assert batch(studies) == 1
+    counts = re.findall(r"(-?\d+)/(-?\d+)", capsys.readouterr().err)
+    told = sorted({(int(done), int(total)) for done, total in counts})
+    assert told == [(1, 2), (2, 2)]
 
 
 @pytest.mark.parametrize("name", ["logs", "batch.csv", "Logs"])

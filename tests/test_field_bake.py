@@ -238,6 +238,14 @@ def test_the_spacing_that_is_named_would_do():
     assert math.prod(grid.shape) * 4 * len(PHASES) * 5 <= 20e6
 
 
+def test_a_size_beyond_all_numbers_is_refused():
+    settings = BakeSettings(spacing_mm=1.0)
+    far = {"ball": MovingSurface(ball_and_core()["ball"].vertices_mm * 1e6,
+                                 ball_and_core()["ball"].triangles, PHASES)}  # fmt: skip
+    with pytest.raises(InputError, match="more than largest_store_mb"):
+        bake_field(None, far, {"stay_in": FIXTURES["stay_in"]}, settings)
+
+
 def test_unusable_surfaces_are_refused_by_phase(tmp_path):
     surfaces = ball_and_core()
     core = surfaces["core"].vertices_mm.copy()

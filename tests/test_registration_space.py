@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,8 @@ from pipeline.job import Skipped
 from pipeline.products import FrameRow, read_frames, write_frames
 from pipeline.registration import space
 from pipeline.registration.clock_offset import Timing
+from pipeline.registration.in_view import require_heart_in_view
+from pipeline.registration.search import Search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
 from pipeline.registration.uncertainty import motion_between
@@ -232,6 +235,19 @@ class TestRefusals:
         words = r"cross the heart.*directions.*ImageToProbe.*units"
         with pytest.raises(UnregistrableError, match=words):
             register(recording.sweeps, recording.phases, surfaces, away, QUICK)
+
+    @pytest.mark.parametrize(("crossing", "refused"), [(2, True), (3, False)])
+    def test_frames_are_asked_for_by_their_share(self, monkeypatch, crossing, refused):
+        """Of 80 frames 24 are looked at, and of 10 of all three are enough."""
+        seen = np.repeat([0.5, 0.0], [crossing, 24 - crossing])
+        level = SimpleNamespace(
+            samples=SimpleNamespace(frames=24), at=lambda _: SimpleNamespace(in_view=seen)
+        )
+        monkeypatch.setattr(Search, "candidates", lambda search, _: [search.start])
+        settings = RegisterSettings(min_frames=10)
+        search = Search(np.eye(4), None, None, None, [np.zeros(40)] * 2, settings)
+        with pytest.raises(UnregistrableError) if refused else nullcontext():
+            require_heart_in_view(level, search)
 
     def test_start_that_is_given_the_other_way_round_is_told(self, surfaces, recording):
         inverse = np.linalg.inv(start_off(recording, 0, 5, 5))

@@ -304,6 +304,20 @@ def test_bigeminy_and_another_rate_have_phases_throughout(beats):
     assert in_known_beats(asked_s[~inside], missed_s).all()
 
 
+@pytest.mark.parametrize("beyond", [0, 1, 2, 3])
+@pytest.mark.parametrize("gap", [2.4, 3.5, 6.9, 7.5])
+@pytest.mark.parametrize("at_the_end", [False, True])
+def test_a_pause_near_an_end_of_the_record_is_seen(beyond, gap, at_the_end):
+    """So many intervals lie between it and the end; it is so many times as long as they are."""
+    rr_s = np.full(20, 0.8)
+    rr_s[beyond] *= gap
+    r_times_s = np.cumsum(np.concatenate([[0.0], rr_s[::-1] if at_the_end else rr_s]))
+    times_s = np.arange(0.0, r_times_s[-1], 0.1)
+    start_s = r_times_s[19 - beyond if at_the_end else beyond]
+    within = (times_s >= start_s) & (times_s < start_s + 0.8 * gap)
+    np.testing.assert_array_equal(in_known_beats(times_s, r_times_s), ~within)
+
+
 def test_times_at_the_ends_have_no_phase_where_the_leads_were_lost():
     r_times_s = np.array([5.0, 5.8, 6.6, 7.4])
     times_s = np.array([3.0, 4.1, 4.3, 5.5, 8.1, 8.3, 11.0])

@@ -301,6 +301,22 @@ def test_folders_behind_links_are_read_and_closed_ones_told(tmp_path: Path) -> N
         files_below(folder / "cine")
 
 
+def test_hidden_folders_are_passed_over(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    before = files_below(folder / "cine")
+    (folder / "cine" / ".AppleDouble").mkdir()
+    (folder / "cine" / ".AppleDouble" / "001").write_text("x")
+    assert files_below(folder / "cine") == before
+
+
+@pytest.mark.parametrize("path", ['"\\0"', "a" * 300])
+def test_a_place_that_no_file_system_has_is_refused(tmp_path: Path, path: str) -> None:
+    folder = study_folder(tmp_path)
+    (folder / "study.yaml").write_text(f"cine: {{path: {path}}}\n")
+    with pytest.raises(InputError, match=r"study\.yaml: names a place that cannot be looked at"):
+        open_study(folder)
+
+
 @pytest.mark.parametrize("path", [None, "cine", "cine/cine.nii.gz"])
 def test_a_nifti_cine_has_its_timing_however_it_is_named(tmp_path: Path, path: str | None) -> None:
     cine = tmp_path / "p" / "cine"

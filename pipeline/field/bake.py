@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -274,7 +275,7 @@ def _require_no_stray_vertex(surface: Surface, where: str) -> None:
 
 
 def _require_room(metadata: FieldMetadata, settings: BakeSettings) -> None:
-    nodes = int(np.prod(metadata.grid.shape_zyx))
+    nodes = math.prod(metadata.grid.shape_zyx)
     size_mb = 4e-6 * nodes * len(metadata.phases) * len(metadata.arrays)
     if size_mb > settings.largest_store_mb:
         spacing_mm = settings.spacing_mm * (size_mb / settings.largest_store_mb) ** (1 / 3)

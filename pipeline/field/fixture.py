@@ -242,7 +242,7 @@ class BakeSettings(Section):
     spacing_mm: float = Field(default=1.5, ge=0.05, le=20)
     """Distance between grid nodes, the same on every axis."""
 
-    margin_mm: float = Field(default=15.0, ge=15)
+    margin_mm: float = Field(default=15.0, ge=15, le=200)
     """Grid around the surfaces on every side, in all phases."""
 
     structures: tuple[str, ...] = ()

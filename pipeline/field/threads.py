@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,17 +32,19 @@ def in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) -> 
     count
         How many points there are.
     """
-
-    def part(start: int, end: int) -> None:
-        ask(slice(start, end), phases if len(phases) == 1 else phases[start:end])
-
     workers = min(processors(), count // POINTS_A_WORKER)
-    if workers < 2:
-        part(0, count)
+    shared(lambda part: ask(part, phases if len(phases) == 1 else phases[part]), count, workers)
+
+
+def shared(work: Callable[[slice], None], count: int, workers: int) -> None:
+    """Do ``count`` pieces of work, of which ``work`` does a slice, by so many threads."""
+    edges = np.linspace(0, count, max(workers, 1) + 1).astype(int).tolist()
+    first, *others = (slice(*pair) for pair in pairwise(edges))
+    if not others:
+        work(first)
         return
-    edges = np.linspace(0, count, workers + 1).astype(int).tolist()
-    with ThreadPoolExecutor(workers - 1) as pool:
-        others = pool.map(part, edges[1:-1], edges[2:])
+    with ThreadPoolExecutor(len(others)) as pool:
+        rest = pool.map(work, others)
         # One thread that need not be started.
-        part(edges[0], edges[1])
-        list(others)
+        work(first)
+        list(rest)

@@ -159,8 +159,8 @@ def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis
     Parameters
     ----------
     rr_ms
-        RR interval of views that have no such file, over which their phases are spread evenly;
-        without it, their header's time step tells.
+        Overrides their RR intervals. Without it, that of the file counts, or, where there is none,
+        the header's time step.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
     intensity, mr_from_index = read_image(path)
     timing = _view_timing(path)
     own = timing if timing.exists() else None
-    triggers, own_rr_ms, _ = _timing(image, path, own, None if own else rr_ms)
+    triggers, own_rr_ms, _ = _timing(image, path, own, rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(own or path))
     pixels = np.ascontiguousarray(intensity, np.float32)
     return LongAxis(
@@ -347,7 +347,7 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
         try:
             numbers = np.asarray(content[key], dtype=float)
             given.append(np.broadcast_to(numbers, shape))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: {needed}; {key} is {_in_words(content[key])}") from error
     return given[0], given[1]
 

@@ -31,7 +31,8 @@ def require_heart_in_view(level: Level, search: Search) -> None:
     if search.start is None:
         return
     settings, frames = search.settings, level.samples.frames
-    needed, seen = max(1, min(settings.min_frames, frames)), _most_in_view(level, search)
+    share = settings.min_frames / sum(map(len, search.phases))
+    needed, seen = max(1, int(share * frames)), _most_in_view(level, search)
     if seen < needed:
         inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
         inverted = _most_in_view(level, inverse) >= needed

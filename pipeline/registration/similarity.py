@@ -12,13 +12,12 @@ Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
 
+from pipeline.field.threads import shared
 from pipeline.geometry import Float, Integer
 from pipeline.registration.frames import Samples
 from pipeline.registration.kernels import SUMS, add_up, bend
@@ -184,17 +183,8 @@ def _looked_at(samples: Samples, tissue: TissueMap, place: _Place, some: slice) 
 
 def _in_parts(add: Callable[[slice], None], samples: Samples) -> None:
     """Add up all frames, each by one thread, several at the same time where they are many."""
-    threads = min(_THREADS, samples.frames, int(samples.first[-1]) // _SAMPLES_A_THREAD)
-    if threads < 2:
-        add(slice(0, samples.frames))
-        return
-    edges = np.linspace(0, samples.frames, threads + 1).astype(int).tolist()
-    first, *others = (slice(*pair) for pair in pairwise(edges))
-    with ThreadPoolExecutor(threads - 1) as pool:
-        rest = pool.map(add, others)
-        # One thread that need not be started.
-        add(first)
-        list(rest)
+    most = int(samples.first[-1]) // _SAMPLES_A_THREAD
+    shared(add, samples.frames, min(_THREADS, samples.frames, most))
 
 
 def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:

@@ -128,6 +128,10 @@ def in_known_beats(
     pairs_s = (rr_s[:-1] + rr_s[1:]) / 2 if len(rr_s) > 1 else rr_s
     usual_s = median_filter(pairs_s, _NEIGHBOURS, mode="nearest")
     longest_s = LONGEST_BEAT * np.concatenate([usual_s[:1], usual_s])[: len(rr_s)]
+    # At a record's ends the filter sees a pause several times over: one that stands alone is held
+    # against the whole record.
+    beside_s = np.maximum(np.append(rr_s[1:], 0.0), np.append(0.0, rr_s[:-1]))
+    longest_s = np.minimum(longest_s, LONGEST_BEAT * np.maximum(beside_s, np.median(pairs_s)))
     too_long = np.concatenate([[False], rr_s > longest_s, [False]])
     known = ~too_long[np.searchsorted(r_times_s, times_s, side="right")]
     first_s, last_s = recorded_s or (np.inf, -np.inf)
