@@ -105,6 +105,30 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
         phases, or no usable timing.
     """
     image = _load(path)
+    _require_stack(image, path)
+    intensity, mr_from_index = read_image(path)
+    edges_mm = np.linalg.norm(mr_from_index[:3, :3], axis=0)
+    _require_millimetres(edges_mm, path)
+    triggers, own_rr_ms, source = _timing(image, path, timing, rr_ms)
+    said = f"{timing or path}" + ("" if rr_ms is None else f", with cine.rr_ms {rr_ms:g}")
+    phases = common_phases(triggers, own_rr_ms, said)
+    cine = Cine(
+        np.ascontiguousarray(intensity, np.float32),
+        mr_from_index,
+        phases,
+        float(own_rr_ms.mean()) / 1000,
+    )
+    doubts = (
+        *doubts_of_size(edges_mm, intensity.shape[1]),
+        *doubts_of_place(image),
+        *(doubts_of_step(_step_ms(image), _notes(path)) if source == HEADER_STEP else ()),
+        *doubts_of_values(cine.intensity[0]),
+    )
+    return Stack(cine, triggers, own_rr_ms, source, (), remarks=doubts)
+
+
+def _require_stack(image: Any, path: Path) -> None:
+    """Refuse what is no cine of several slices, by its shape alone."""
     if len(image.shape) > 4 and 1 in image.shape:
         raise InputError(
             f"{path}: its shape is {image.shape}; store it without the axes of length 1, as "
@@ -121,36 +145,22 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
             f"{path}: its shape is {image.shape}, so {image.shape[2]} slices of {image.shape[0]} "
             f"columns and {image.shape[1]} rows; store it as (columns, rows, slices, phases)"
         )
-    intensity, mr_from_index = read_image(path)
-    phase_count, slice_count = intensity.shape[:2]
+    slice_count, phase_count = image.shape[2:]
     if slice_count < MIN_SLICES or phase_count < MIN_PHASES:
         raise InputError(
             f"{path}: {slice_count} slices of {phase_count} phases; "
             f"at least {MIN_SLICES} slices of {MIN_PHASES} phases are needed"
         )
-    edges_mm = np.linalg.norm(mr_from_index[:3, :3], axis=0)
+
+
+def _require_millimetres(edges_mm: Float, path: Path) -> None:
+    """Refuse voxels that no cine has."""
     if edges_mm.min() < VOXEL_MM[0] or edges_mm.max() > VOXEL_MM[1]:
         raise InputError(
             f"{path}: its voxels measure {' x '.join(f'{edge:.3g}' for edge in edges_mm)} mm, a "
             f"cine's edges are {VOXEL_MM[0]:g} to {VOXEL_MM[1]:g} mm; write its affine in "
             "millimetres"
         )
-    triggers, own_rr_ms, source = _timing(image, path, timing, rr_ms)
-    said = f"{timing or path}" + ("" if rr_ms is None else f", with cine.rr_ms {rr_ms:g}")
-    phases = common_phases(triggers, own_rr_ms, said)
-    cine = Cine(
-        np.ascontiguousarray(intensity, np.float32),
-        mr_from_index,
-        phases,
-        float(own_rr_ms.mean()) / 1000,
-    )
-    doubts = (
-        *doubts_of_size(edges_mm, slice_count),
-        *doubts_of_place(image),
-        *(doubts_of_step(_step_ms(image), _notes(path)) if source == HEADER_STEP else ()),
-        *doubts_of_values(cine.intensity[0]),
-    )
-    return Stack(cine, triggers, own_rr_ms, source, (), remarks=doubts)
 
 
 def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis, ...]:
@@ -159,8 +169,8 @@ def read_nifti_views(folder: Path, rr_ms: float | None = None) -> tuple[LongAxis
     Parameters
     ----------
     rr_ms
-        Overrides their RR intervals. Without it, that of the file counts, or, where there is none,
-        the header's time step.
+        RR interval of views that have no such file, over which their phases are spread evenly;
+        without it, their header's time step tells.
 
     Raises
     ------
@@ -206,7 +216,7 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
     intensity, mr_from_index = read_image(path)
     timing = _view_timing(path)
     own = timing if timing.exists() else None
-    triggers, own_rr_ms, _ = _timing(image, path, own, rr_ms)
+    triggers, own_rr_ms, _ = _timing(image, path, own, None if own else rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(own or path))
     pixels = np.ascontiguousarray(intensity, np.float32)
     return LongAxis(

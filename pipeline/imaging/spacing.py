@@ -44,16 +44,39 @@ def regular_steps(
         may not be, else where a gap is wider than one slice or than `WIDEST_GAP_MM`.
     """
     positions_mm = np.array([one[0].position_mm for one in slices])
-    lengths_mm = np.diff(positions_mm, axis=0) @ slices[0][0].normal
+    normal = slices[0][0].normal
+    lengths_mm = np.diff(positions_mm, axis=0) @ normal
     _require_no_second(slices, lengths_mm, where)
     usual_mm = float(lengths_mm.min())
     counts = np.maximum(np.rint(lengths_mm / usual_mm), 1).astype(int)
     numbers = np.concatenate([[0], np.cumsum(counts)])
-    step_mm = (positions_mm[-1] - positions_mm[0]) / numbers[-1]
-    away_mm = positions_mm - positions_mm[0] - numbers[:, None] * step_mm
-    off_mm = np.linalg.norm(away_mm, axis=1)
     allowed_mm = max(0.1, 0.02 * usual_mm)
     _require_one_place(slices, allowed_mm, where)
+    step_mm = (positions_mm[-1] - positions_mm[0]) / numbers[-1]
+    away_mm = positions_mm - positions_mm[0] - numbers[:, None] * step_mm
+    _require_even(slices, away_mm, lengths_mm, allowed_mm, where)
+    # What positions of few decimals lean by; a grid has its axes at right angles.
+    upright_mm = (step_mm @ normal) * normal
+    aside_mm = float(np.linalg.norm(step_mm - upright_mm) * numbers[-1])
+    if aside_mm > allowed_mm:
+        raise InputError(
+            f"{where}: slices are shifted sideways, each beside the one before: from the first to "
+            f"the last by {aside_mm:.2f} mm, {allowed_mm:.2f} mm are allowed; resample the stack "
+            "to a grid with axes at right angles"
+        )
+    _require_no_wide_gap(slices, lengths_mm, counts, fill, where)
+    return np.asarray(upright_mm), np.asarray(numbers, np.int64)
+
+
+def _require_even(
+    slices: Sequence[Sequence[Frame]],
+    away_mm: Float,
+    lengths_mm: Float,
+    allowed_mm: float,
+    where: str,
+) -> None:
+    """Refuse slices that lie ``(slice, 3)`` away from their places in an even stack."""
+    off_mm = np.linalg.norm(away_mm, axis=1)
     if off_mm.max() > allowed_mm:
         worst = int(off_mm.argmax())
         along_mm = abs(float(away_mm[worst] @ slices[0][0].normal))
@@ -63,33 +86,30 @@ def regular_steps(
             f"({along_mm:.2f} mm of it along the normal), {allowed_mm:.2f} mm are allowed; steps "
             f"along the normal are {lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
         )
-    # What positions of few decimals lean by; a grid has its axes at right angles.
-    upright_mm = (step_mm @ slices[0][0].normal) * slices[0][0].normal
-    aside_mm = float(np.linalg.norm(step_mm - upright_mm) * numbers[-1])
-    if aside_mm > allowed_mm:
-        raise InputError(
-            f"{where}: slices are shifted sideways, each beside the one before: from the first to "
-            f"the last by {aside_mm:.2f} mm, {allowed_mm:.2f} mm are allowed; resample the stack "
-            "to a grid with axes at right angles"
-        )
+
+
+def _require_no_wide_gap(
+    slices: Sequence[Sequence[Frame]], lengths_mm: Float, counts: Integer, fill: bool, where: str
+) -> None:
+    """Refuse a gap between slices: any, or where ``fill`` what is too wide to be filled."""
     too_wide = (counts > 2) | (lengths_mm > WIDEST_GAP_MM) if fill else True
     wide = np.flatnonzero((counts > 1) & too_wide)
-    if len(wide):
-        first = wide[0]
-        remedy = (
-            f"; cine.fill_gaps fills one slice in at most {WIDEST_GAP_MM:g} mm, which this is not; "
-            "add the missing slice"
-            if fill
-            else "; add the missing slice, or, where it is one in at most "
-            f"{WIDEST_GAP_MM:g} mm, let its neighbours stand in for it: cine.fill_gaps: true in "
-            "study.yaml"
-        )
-        raise InputError(
-            f"{where}: missing slice between {slices[first][0].where} and "
-            f"{slices[first + 1][0].where}: {lengths_mm[first]:.2f} mm apart, the others are "
-            f"{usual_mm:.2f} mm apart{remedy}"
-        )
-    return np.asarray(upright_mm), np.asarray(numbers, np.int64)
+    if not len(wide):
+        return
+    first = wide[0]
+    remedy = (
+        f"; cine.fill_gaps fills one slice in at most {WIDEST_GAP_MM:g} mm, which this is not; "
+        "add the missing slice"
+        if fill
+        else "; add the missing slice, or, where it is one in at most "
+        f"{WIDEST_GAP_MM:g} mm, let its neighbours stand in for it: cine.fill_gaps: true in "
+        "study.yaml"
+    )
+    raise InputError(
+        f"{where}: missing slice between {slices[first][0].where} and "
+        f"{slices[first + 1][0].where}: {lengths_mm[first]:.2f} mm apart, the others are "
+        f"{lengths_mm.min():.2f} mm apart{remedy}"
+    )
 
 
 def _require_one_place(slices: Sequence[Sequence[Frame]], allowed_mm: float, where: str) -> None:
