@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import nibabel
@@ -18,6 +19,7 @@ from cine_files import (
     PHASES,
     ROWS,
     SLICES,
+    STEP_MM,
     Change,
     assert_is_the_stack,
     dicom_frame,
@@ -32,6 +34,7 @@ from pydicom.dataset import FileDataset
 
 from pipeline.errors import InputError
 from pipeline.geometry import transform_points
+from pipeline.imaging.frames import are_parallel, have_same_axes
 from pipeline.imaging.nifti import read_image, read_nifti_cine, read_nifti_views, write_image
 
 
@@ -471,3 +474,79 @@ def test_nifti_written_then_read_is_the_same_image_in_the_same_place(
 def test_pydicom_itself_reads_what_the_tests_write(tmp_path: Path) -> None:
     write_dicom(tmp_path)
     assert pydicom.dcmread(tmp_path / "0000.dcm").pixel_array.shape == (ROWS, COLUMNS)
+
+
+def test_the_rr_interval_is_the_mean_of_the_slices(tmp_path: Path) -> None:
+    def own_rate(data: FileDataset, number: int, phase: int) -> bool:
+        data.NominalInterval = 770 + 20 * number
+        data.TriggerTime = phase / PHASES * float(data.NominalInterval)
+        return True
+
+    write_dicom(tmp_path, own_rate)
+    stack = read_dicom_cine(tmp_path)
+    np.testing.assert_allclose(stack.rr_ms, [770, 790, 810, 830])
+    assert stack.cine.rr_s == pytest.approx(0.8)
+
+
+def test_the_nominal_interval_goes_before_the_rounded_heart_rate(tmp_path: Path) -> None:
+    write_dicom(tmp_path, lambda data, number, phase: setattr(data, "HeartRate", "74") is None)
+    assert read_dicom_cine(tmp_path).cine.rr_s == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(("unit", "step"), [("sec", 0.16), ("msec", 160), ("usec", 160_000)])
+def test_every_unit_of_nifti_times_is_known(tmp_path: Path, unit: str, step: float) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4, 5), np.int16), np.diag([1.5, 1.5, 8, 1]))
+    image.header.set_xyzt_units("mm", unit)
+    image.header.set_zooms((1.5, 1.5, 8, step))
+    nibabel.save(image, tmp_path / "cine.nii.gz")
+    assert read_nifti_cine(tmp_path / "cine.nii.gz", None).cine.rr_s == pytest.approx(0.8)
+
+
+def test_two_hundredths_of_a_step_are_the_most_that_a_slice_may_be_off(tmp_path: Path) -> None:
+    def moved(by_mm: float) -> Change:
+        def change(data: FileDataset, number: int, phase: int) -> bool:
+            place = ORIGIN_MM + (number * STEP_MM + by_mm * (number == 2)) * NORMAL
+            data.ImagePositionPatient = place.tolist()
+            return True
+
+        return change
+
+    write_dicom(tmp_path / "near", moved(0.15))
+    read_dicom_cine(tmp_path / "near")
+    write_dicom(tmp_path / "off", moved(0.3))
+    with pytest.raises(InputError, match="not evenly spaced"):
+        read_dicom_cine(tmp_path / "off")
+
+
+def test_an_affine_that_leans_by_a_quarter_of_a_degree_is_refused(tmp_path: Path) -> None:
+    affine = np.diag([1.5, 1.5, 8, 1])
+    affine[0, 2] = 8 * np.tan(np.radians(0.25))
+    nifti_cine(tmp_path / "cine.nii.gz", affine)
+    with pytest.raises(InputError, match="sheared"):
+        read_nifti_cine(tmp_path / "cine.nii.gz", None)
+
+
+@pytest.mark.parametrize(("off_mm", "told"), [(0.4, 0), (0.6, 1)])
+def test_placements_half_a_millimetre_apart_are_told(
+    tmp_path: Path, off_mm: float, told: int
+) -> None:
+    pixels = np.random.default_rng(0).normal(100, 20, (8, 6, 4, 5)).astype(np.float32)
+    affine = np.diag([1.5, 1.5, 8, 1])
+    image = nibabel.Nifti1Image(pixels, affine)
+    affine[0, 3] += off_mm
+    image.set_sform(affine, code=1)
+    image.set_qform(np.diag([1.5, 1.5, 8, 1]), code=1)
+    nibabel.save(image, tmp_path / "cine.nii.gz")
+    remarks = read_nifti_cine(tmp_path / "cine.nii.gz", None, 800).remarks
+    assert len([one for one in remarks if "sform and qform" in one]) == told
+
+
+def test_images_two_degrees_apart_are_not_of_one_stack() -> None:
+    def turned(degrees: float) -> SimpleNamespace:
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        axes = np.array([[1.0, 0, 0], [0, c, s]])
+        return SimpleNamespace(axes=axes, normal=np.cross(*axes))
+
+    for degrees, same in ((0.9, True), (1.1, False)):
+        assert have_same_axes(turned(0), turned(degrees)) == same
+        assert are_parallel(turned(0), turned(degrees)) == same

@@ -9,7 +9,13 @@ import pytest
 from ellipsoid_heart import moving_surfaces, record, start_off
 
 from pipeline.errors import InputError
-from pipeline.registration.clock_offset import Timing, estimate_offset, settle_clock
+from pipeline.registration.clock_offset import (
+    ClockOffset,
+    Timing,
+    _Profile,
+    estimate_offset,
+    settle_clock,
+)
 from pipeline.registration.pose_search import climb
 from pipeline.registration.search import Best, prepare_search
 from pipeline.registration.settings import RegisterSettings
@@ -197,3 +203,19 @@ def test_registration_is_made_at_the_phases_of_one_clock(recording, surfaces, tr
     else:
         assert found.clock is None
         assert found.score < 0.9 * truly.score
+
+
+def test_an_offset_counts_from_three_standard_deviations_on():
+    assert not ClockOffset(0.029, 0.010, np.eye(4)).significant
+    assert ClockOffset(-0.031, 0.010, np.eye(4)).significant
+
+
+@pytest.mark.parametrize(("sd_s", "known"), [(0.019, True), (0.0199, False)])
+def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, surfaces, sd_s, known):
+    """The model's own 5 ms counted in."""
+    monkeypatch.setattr(_Profile, "nearest", lambda self, pose, offset_s: (0.1, pose))
+    monkeypatch.setattr(_Profile, "summit", lambda self, pose, offset_s: (0.1, sd_s))
+    monkeypatch.setattr(_Profile, "climb", lambda self, pose, offset_s: pose)
+    found = estimated(recording, surfaces, stamped(recording))
+    assert (found.offset_s is not None) == known
+    assert found.sd_s == (pytest.approx(np.hypot(sd_s, 0.005)) if known else np.inf)

@@ -418,3 +418,8 @@ def test_of_groups_of_channels_the_longest_of_voltages_is_read(tmp_path):
     groups = [pressure, averaged, waveform_group(STEPS_UV, "uV")]
     ecg = read_ecg(write_dicom(tmp_path / "ecg.dcm", groups))
     np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0)
+
+
+def test_nanovolts_become_millivolts(tmp_path):
+    stem = write_wfdb(tmp_path, units="nV")
+    np.testing.assert_allclose(read_ecg(stem).signal_mv, STEPS_UV / 1000.0 * 1e-6, rtol=1e-9)

@@ -247,3 +247,23 @@ def test_truth_of_sweeps_by_other_names_is_told(tmp_path):
     assert _frame_phase_errors(job, {"us_frames": {"left": one}}) == pytest.approx([0.05])
     with pytest.raises(InputError, match=r"truth\.json: knows no sweep left, only sweep_000; give"):
         _frame_phase_errors(job, {"us_frames": {"sweep_000": one}})
+
+
+def test_target_registration_error_is_counted_where_the_mr_has_the_targets():
+    """A turn about z in the MR frame, after a true pose that takes the tracker elsewhere."""
+    truth = rigid(np.array([0.4, -1.1, 0.7]), np.array([200.0, -90.0, 35.0]))
+    off = rigid(np.array([0, 0, 0.1]), np.zeros(3))
+    targets = np.array([[50.0, 0, 7.0], [0, 0, 90.0]])
+    errors = target_registration_error_mm(off @ truth, truth, targets)
+    np.testing.assert_allclose(errors, [100 * np.sin(0.05), 0], atol=1e-9)
+
+
+def test_hausdorff_is_the_larger_of_both_ways():
+    """A piece of 7 % of one surface's area, of 3.5 % of both, that the other lacks."""
+    near, far = sphere(10.0), sphere(2.75, (100, 0, 0))
+    both = Surface(
+        np.concatenate([near.vertices_mm, far.vertices_mm]),
+        np.concatenate([near.triangles, far.triangles + len(near.vertices_mm)]),
+    )
+    for one, other in ((near, both), (both, near)):
+        assert surface_distance(one, other, 2000).hausdorff95_mm > 87

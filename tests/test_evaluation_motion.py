@@ -270,3 +270,9 @@ def test_truth_whose_meshes_do_not_correspond_has_no_motion(job: Job) -> None:
     assert "motion_error_mm" not in metrics["lv_endocardium"]
     assert "motion_error_mm" in metrics["rv_endocardium"]
     assert len(metrics["lv_endocardium"]["mean_surface_distance_mm"]) == 2
+
+
+def test_phases_that_are_off_by_a_frame_are_not_those_of_the_truth(job: Job) -> None:
+    write_table(job.products / "ingest" / "phases.json", {"phases": (PHASES + 0.03).tolist()})
+    with pytest.raises(InputError, match="its phases are not those of the cine"):
+        evaluate.run(job)

@@ -16,6 +16,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.exact import ExactSurface, points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
+from pipeline.field.certificate import certify
 from pipeline.field.fixture import Bounds
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
@@ -407,3 +408,21 @@ def test_unusable_folders_are_refused_and_nothing_is_left(folder, tmp_path, dama
     with pytest.raises(InputError, match=words):
         bake_own_surfaces(folder, tmp_path / "out", own_settings())
     assert {one.name for one in (tmp_path / "out").glob("*")} <= {".lock"}
+
+
+def test_in_a_beat_of_half_the_length_a_force_changes_twice_as_much_in_a_millisecond(tmp_path):
+    slow, fast = (
+        bake_small(tmp_path / f"{rr_s}.zarr", rr_s=rr_s)["force_change_max_n_per_ms"]
+        for rr_s in (0.8, 0.4)
+    )
+    assert fast == pytest.approx(2 * slow, rel=0.05)
+
+
+def test_nodes_on_the_wrong_side_are_counted_however_near_the_surface(tmp_path):
+    bake_small(tmp_path / "f.zarr")
+    field = ForceField.open(tmp_path / "f.zarr")
+    chunk = tmp_path / "f.zarr" / "distance" / "ball" / "c" / "0" / "0" / "0" / "0"
+    values = np.memmap(chunk, "<f4", "r+")
+    values[np.abs(values) < 2] *= -1
+    surfaces = {name: ball_and_core()[name] for name in field.structures}
+    assert certify(field, surfaces, 2000, lambda: None)["sign_errors"] > 0

@@ -15,6 +15,7 @@ import pytest
 import pyvista
 import SimpleITK
 from field_baked import PHASES, RR_S, bake_small
+from field_random import ORIGIN_MM, SPACING_MM, write_random
 
 from pipeline.cli import main
 from pipeline.errors import InputError
@@ -252,3 +253,42 @@ def test_a_link_at_the_target_is_not_followed(path, tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(InputError, match="exists already"):
         export_field(path, "mhd", tmp_path / "link")
+
+
+def test_an_oblong_grid_keeps_its_axes(tmp_path):
+    """Counts, steps and origin differ along x, y and z: none can stand for another."""
+    values = write_random(tmp_path / "field.zarr", 7, PHASES).astype(np.float32)
+    out = {form: export_field(tmp_path / "field.zarr", form, tmp_path / form) for form in WRITERS}
+    origin, steps = np.array(ORIGIN_MM), np.array(SPACING_MM)
+    whole = SimpleITK.ReadImage(out["nrrd"] / "distance_s.seq.nrrd")
+    images = [SimpleITK.VectorIndexSelectionCast(whole, k) for k in range(5)]
+    images += [SimpleITK.ReadImage(out["mhd"] / f"distance_s_{k:03d}.mhd") for k in range(5)]
+    nifti = SimpleITK.ReadImage(out["nifti"] / "distance_s.nii")
+    images += [nifti[:, :, :, k] for k in range(5)]
+    for number, image in enumerate(images):
+        assert image.GetSize() == (7, 5, 3)
+        np.testing.assert_allclose(image.GetSpacing(), steps, rtol=1e-6)
+        np.testing.assert_allclose(np.reshape(image.GetDirection(), (3, 3)), np.eye(3), atol=1e-6)
+        np.testing.assert_allclose(image.GetOrigin(), origin, atol=1e-6)
+        np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), values[number % 5])
+    for k in range(5):
+        image = pyvista.read(out["vti"] / f"phase_{k:03d}.vti")
+        assert image.dimensions == (7, 5, 3)
+        np.testing.assert_allclose((image.origin, image.spacing), (origin, steps))
+        np.testing.assert_array_equal(image.point_data["distance_s"], values[k].ravel())
+    grid = ElementTree.parse(out["sofa"] / "grids.xml").getroot()[0]
+    assert [grid.get(key) for key in ("nx", "ny", "nz")] == ["7", "5", "3"]
+    box = np.array(grid.get("box").split(), float).reshape(2, 3)
+    np.testing.assert_allclose(box, [origin, origin + (6, 4, 2) * steps])
+
+
+def test_nifti_says_when_the_first_phase_is(folders):
+    header = nibabel.load(folders["nifti"] / "distance_ball.nii").header
+    assert float(header["toffset"]) == pytest.approx(RR_S * PHASES[0])
+
+
+def test_shares_of_a_beat_have_no_unit_in_nrrd(tmp_path):
+    write_random(tmp_path / "field.zarr", 7, PHASES)
+    export_field(tmp_path / "field.zarr", "nrrd", tmp_path / "nrrd")
+    head = (tmp_path / "nrrd" / "distance_s.seq.nrrd").read_bytes().partition(b"\n\n")[0]
+    assert b'units: "" "" "" ""' in head.splitlines()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from c_program import HERE, SANITIZE, build, run
 from field_baked import FIXTURES, PHASES, bake_small
+from field_random import EVEN, ORIGIN_MM, SPACING_MM, write_random
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
@@ -378,3 +379,30 @@ def test_metadata_is_understood_whatever_the_order_of_its_keys(path, program, tm
     question = np.array([10.0, 5, 3, 0.4]).tobytes()
     other = described(path, tmp_path / "f.zarr", reorder)
     assert run(program, other, given=question).stdout == run(program, path, given=question).stdout
+
+
+def test_each_axis_of_an_oblong_grid_ends_where_its_own_nodes_do(tmp_path, program):
+    write_random(tmp_path / "f.zarr", 7, EVEN)
+    field = ForceField.open(tmp_path / "f.zarr")
+    low = np.array(ORIGIN_MM)
+    size = np.array([6, 4, 2]) * SPACING_MM
+    points = np.concatenate([low + size * (0.5 + share * np.eye(3)) for share in (0.49, 0.51)])
+    done = run(program, tmp_path / "f.zarr", "contains", given=points.tobytes())
+    expected = [True] * 3 + [False] * 3
+    assert (np.frombuffer(done.stdout) == 1).tolist() == expected
+    assert field.contains(points).tolist() == expected
+
+
+def test_the_energy_tank_is_pythons_where_places_are_unknown(path, watched):
+    """What the hand gave on a way that was not seen fills neither."""
+    rng = np.random.default_rng(3)
+    points = np.cumsum(rng.normal(scale=0.3, size=(2000, 3)), axis=0)
+    points[rng.random(2000) < 0.2] = np.nan
+    forces = rng.normal(scale=1.5, size=(2000, 3))
+    tank = EnergyTank(3.0, 8.0)
+    expected = [(*tank.passed(p, f), tank.level_mj) for p, f in zip(points, forces, strict=True)]
+
+    done = run(watched, path, "tank", 3.0, 8.0, given=np.column_stack([points, forces]).tobytes())
+
+    found = np.frombuffer(done.stdout).reshape(-1, 4)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)

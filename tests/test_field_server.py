@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from c_program import HERE, SANITIZE, build, run
 from field_baked import bake_small
+from field_random import EVEN, ORIGIN_MM, write_random
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
@@ -366,3 +367,15 @@ def test_both_languages_tell_the_same_share_outside_the_grid(path, program):
     for refused in (np.full((4, 4), np.nan), by_columns, in_metres):
         given = " ".join(map(repr, map(float, refused.ravel()))).encode()
         assert run(program, path, "outside", given=given).stdout.split() == [b"1", b"1", b"1"]
+
+
+def test_a_tool_leaves_an_oblong_grid_where_its_axis_ends(tmp_path, program):
+    """From the grid's first corner 40 mm along y, of which the grid has 8."""
+    write_random(tmp_path / "f.zarr", 7, EVEN)
+    # The driver's lines, longest piece 70 mm along -z: turned so that y of the tool is y of the MR.
+    pose = np.eye(4)
+    pose[:3, 3] = np.array(ORIGIN_MM) - (5, 0, 0)
+    given = " ".join(map(repr, map(float, pose.ravel()))).encode()
+    found = float(run(program, tmp_path / "f.zarr", "outside", given=given).stdout.split()[0])
+    # 5 mm before the grid, 8 of 40 mm within it, 70 mm beside it.
+    assert found == pytest.approx(1 - 8 / 115, abs=1e-9)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, bake_small
+from field_random import ORIGIN_MM, SPACING_MM, write_random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -310,3 +311,28 @@ def test_a_manifest_has_one_spelling():
     files = {"b": {"size": 1, "sha256": "x"}, "a": {"size": 2, "sha256": "y"}}
 
     assert canonical_manifest(files) == canonical_manifest(dict(reversed(files.items())))
+
+
+def test_the_description_of_an_oblong_grid_keeps_its_axes(tmp_path):
+    write_random(tmp_path / "f.zarr", 7, PHASES)
+    ome = json.loads((tmp_path / "f.zarr" / "zarr.json").read_text())["attributes"]["ome"]
+    for scale in ome["multiscales"]:
+        step, start = scale["datasets"][0]["coordinateTransformations"]
+        assert step["scale"][1:] == list(SPACING_MM[::-1])
+        assert start["translation"][1:] == list(ORIGIN_MM[::-1])
+
+
+def test_a_sealed_potential_that_is_nearly_the_formula_is_found(copy):
+    chunk = copy / "potential" / "guide" / "c" / "2" / "0" / "0" / "0"
+    values = np.fromfile(chunk, dtype="<f4")
+    values[np.argmin(np.abs(values - 0.5))] += 1e-6
+    values.tofile(chunk)
+    edit(copy, lambda described: None)
+    with pytest.raises(InputError, match="guide: phase 2 is not the formula"):
+        verify_field(copy)
+
+
+def test_a_sealed_spline_that_is_a_micrometre_off_is_found(copy):
+    rewrite(copy, lambda mm: mm + 1e-3, arrays=("spline/ball",))
+    with pytest.raises(InputError, match=r"spline/ball: phase 0 misses distance/ball by 0\.001 mm"):
+        verify_field(copy)

@@ -180,3 +180,8 @@ class TestFixturesOfAStudyWithoutAnAtrium:
         words = f"{who} needs left_atrium, which has no surface: no phase shows it; take it out"
         with pytest.raises(InputError, match=words):
             fixtures_for(Settings.model_validate(settings), SURFACES, LOST)
+
+
+def test_known_devices_render_what_their_makers_say():
+    known = {name: (one.force_n, one.stiffness_n_per_m) for name, one in DEVICES.items()}
+    assert known == {"touch": (3.3, 400), "falcon": (8.9, None), "omega7": (12, 5000)}

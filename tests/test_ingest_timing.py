@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -95,3 +96,19 @@ def test_phases_in_pairs_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(ingest, "read_nifti_cine", paired)
     [told] = remarks_of(tmp_path, 800.0, None)
     assert told.startswith("phases come in pairs, 0.004 of a beat apart")
+
+
+def test_the_way_round_to_the_first_phase_counts_from_that_phase() -> None:
+    """Shares 0.3 to 0.85 of a beat: 0.45 of it, to 0.3 of the next, is not shown."""
+
+    def doubts(phases: Any) -> list[str]:
+        cine: Any = SimpleNamespace(rr_s=0.8, phases=phases)
+        job: Any = None
+        stack: Any = SimpleNamespace(cine=cine)
+        return ingest._doubts_of_beat(job, stack, None)
+
+    (told,) = doubts(np.linspace(0.3, 0.85, 12))
+    assert told.startswith("no image shows the 45% of the heartbeat after phase 0.85")
+    assert doubts(np.linspace(0, 0.76, 12)) == []
+    (told,) = doubts(np.linspace(0, 0.74, 12))
+    assert told.startswith("no image shows the 26%")

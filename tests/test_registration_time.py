@@ -360,3 +360,9 @@ def test_a_sampling_rate_told_twice_as_low_is_doubted():
     assert "38 times a minute" in said
     assert "75 times in the MR" in said
     assert "sampling rate" in said
+
+
+def test_one_beat_that_was_not_found_leaves_its_interval_without_phases():
+    r_times_s = np.delete(0.3 + 0.8 * np.arange(20), 10)
+    known = in_known_beats(np.array([7.4, 7.6, 8.3, 9.0, 9.2]), r_times_s)
+    assert known.tolist() == [True, False, False, False, True]

@@ -20,6 +20,7 @@ from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import AS_IT_IS, Size
 from pipeline.registration.uncertainty import (
+    Curvature,
     chance_below,
     curvature_at,
     expected_tre_mm,
@@ -285,3 +286,22 @@ class Result:
 
     verdict: str
     reason: str
+
+
+def test_a_turn_that_the_shift_undoes_at_a_point_leaves_it_in_its_place():
+    """Shift and turn err together: about the point itself, which stays, not about the centre."""
+    way = 0.05 * np.array([0, -60.0, 0, 0, 0, 1])
+    points_mm = PIVOT.centre_mm + np.array([[60.0, 0, 0]])
+    assert chance_below(np.outer(way, way), PIVOT.centre_mm, points_mm, 1e-3) == 1
+
+
+def test_nine_frames_that_bear_it_out_are_one_too_few():
+    assert judge(Evidence(**(SOUND | {"valid": 9})), RegisterSettings()).grade == "failed"
+    assert judge(Evidence(**(SOUND | {"valid": 10})), RegisterSettings()).grade == "doubtful"
+
+
+def test_six_fitted_parameters_are_taken_off_the_frames():
+    slopes = np.concatenate([np.eye(6), -np.eye(6)])
+    # Frames of sweeps of their own: slopes' squares add up to 2, and 12 frames leave 6 free.
+    found = sandwich(Curvature(slopes, np.eye(6)), np.arange(12))
+    np.testing.assert_allclose(found, 4 * np.eye(6))

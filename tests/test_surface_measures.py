@@ -9,7 +9,12 @@ import pytest
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.surface.crossings import crossing_triangles
-from pipeline.surface.measures import MUSCLE_G_ML, ejection_fraction, end_systole, measures
+from pipeline.surface.measures import (
+    ejection_fraction,
+    end_systole,
+    measures,
+    segment_names,
+)
 
 PHASES = np.array([0.0, 0.4])
 INNER_MM, OUTER_MM = (25.0, 20.0), (33.0, 31.0)
@@ -74,7 +79,7 @@ def test_volumes_ejection_and_mass_are_those_of_half_balls(table):
     )
     assert table["lv_ejection_fraction"] == pytest.approx(1 - (20 / 25) ** 3, abs=1e-3)
     assert table["rv_ejection_fraction"] == pytest.approx(1 - (18 / 20) ** 3, abs=1e-3)
-    mass = MUSCLE_G_ML * half * (np.array(OUTER_MM) ** 3 - np.array(INNER_MM) ** 3)
+    mass = 1.05 * half * (np.array(OUTER_MM) ** 3 - np.array(INNER_MM) ** 3)
     np.testing.assert_allclose(table["lv_mass_g"], mass, rtol=4e-3)
 
 
@@ -180,3 +185,19 @@ def test_the_middle_of_a_plateau_ends_systole_not_the_very_smallest_volume() -> 
     volume_ml = np.where((phases >= 0.3) & (phases <= 0.5), 50.0, 120.0)
     volume_ml[6] -= 1
     assert end_systole(phases, volume_ml) == pytest.approx(0.4)
+
+
+def test_end_systole_is_within_a_quarter_of_the_stroke_volume():
+    volume_ml = np.full(20, 100.0)
+    volume_ml[6:10] = 60, 69, 71, 79
+    assert end_systole(np.arange(20) / 20, volume_ml) == pytest.approx(0.325)
+
+
+def test_levels_are_thirds_of_the_length():
+    inner = SURFACES["lv_endocardium"].at(0)
+    height = inner.vertices_mm @ POLE
+    walled = height < height.max() - 0.1
+    share = (height - height.min()) / np.ptp(height[walled])
+    names = segment_names(inner, walled, POLE, None)
+    for name, low, high in (("apical", 0.1, 1 / 3), ("mid", 1 / 3, 2 / 3), ("basal", 2 / 3, 1)):
+        assert set(names[walled & (share > low + 1e-6) & (share < high - 1e-6)]) == {name}

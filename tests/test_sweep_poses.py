@@ -249,3 +249,13 @@ def test_the_transform_for_slicer_puts_tracker_points_beside_the_mr(tmp_path):
     tip = np.array([12.0, -7.0, 30.0])
     shown = turn * stored.GetInverse().TransformPoint((turn * tip).tolist())
     np.testing.assert_allclose(shown, turn * (mr_from_tracker @ [*tip, 1])[:3], atol=1e-9)
+
+
+def test_a_reference_that_rests_by_two_poses_of_the_probe_is_left_alone(tmp_path):
+    """The probe moves in both frames; where the reference stands follows from both together."""
+    fields = without(with_reference(), "ReferenceToTrackerTransform")
+    for k in range(FRAMES):
+        pose = np.linalg.inv(reference(0)) @ rigid(k)
+        fields[f"Seq_Frame{k:04d}_{PROBE_TO_REFERENCE}"] = text(pose)
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    np.testing.assert_allclose(sweep.tracker_from_reference, [reference(0)] * FRAMES, atol=1e-6)
