@@ -328,7 +328,7 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
 
     Writes a row for each beat: R time (s, on the recording's clock), kind,
     whether the phase was valid, best lead, RR interval, likeness to other beats,
-    and when it became known.
+    when it became known, and whether its shape is unlike the others'.
 
     Parameters
     ----------

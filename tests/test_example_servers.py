@@ -94,8 +94,10 @@ def test_c_server_is_cpp_too(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
-def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
-    record, _ = recorded(tmp_path)
+@pytest.mark.parametrize("settings", [{}, {"atrial_probability": 0.1}])
+def test_c_server_renders_the_same_forces(tmp_path, path, capsys, settings):
+    """In a regular heart, and where beats come early that look like the others."""
+    record, _ = recorded(tmp_path, **settings)
     peaks = tmp_path / "peaks.csv"
     assert main(["rpeaks", str(record), "--out", str(peaks)]) == 0
     words = [str(word) for word in (path, peaks, *TIP_MM)]
@@ -125,7 +127,7 @@ def test_c_server_renders_the_same_forces(tmp_path, path, capsys):
     np.testing.assert_allclose(by_c[:, 4:], by_python[:, 4:], rtol=0, atol=2e-3)
 
 
-GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200\n"
+GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200,0\n"
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
@@ -134,17 +136,19 @@ GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200\n"
     [
         "abc,,",
         "2026-01-01,normal,1",
-        "2.0,normal,1,II,0.8,0.999,2.1x",
-        "2.0,regular,1,II,0.8,0.999,2.13",
-        "nan,normal,1,II,0.8,0.999,2.13",
+        "2.0,normal,1,II,0.8,0.999,2.1x,0",
+        "2.0,normal,1,II,0.8,0.999,2.13,",
+        "2.0,normal,1,II,0.8,0.999,2.13,ectopic",
+        "2.0,regular,1,II,0.8,0.999,2.13,0",
+        "nan,normal,1,II,0.8,0.999,2.13,0",
         # Cut off in the last number.
         "2.0,normal,1,II,0.8,0.999,1",
         "",
-        "2.0,normal,1," + "I" * 300 + ",0.8,0.999,2.13",
+        "2.0,normal,1," + "I" * 300 + ",0.8,0.999,2.13,0",
     ],
 )
 def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, row):
-    head = "time_s,kind,valid,lead,rr_s,likeness,known_s\n"
+    head = "time_s,kind,valid,lead,rr_s,likeness,known_s,strange\n"
     program = build(EXAMPLES / "server.c", tmp_path / "server", "-std=c99")
     words = [str(program), str(path), str(tmp_path / "peaks.csv"), *map(str, TIP_MM)]
     (tmp_path / "peaks.csv").write_text(f"{head}{GOOD_ROW}{row}\n{GOOD_ROW}")

@@ -44,17 +44,22 @@ typedef struct {
 static int is_peak(char *line, peak *found)
 {
     static const char *const kinds[] = {"normal", "ectopic", "irregular"};
-    char *kind = strchr(line, ','), *last = strrchr(line, ','), *at;
+    char *kind = strchr(line, ','), *strange, *known_s, *at;
     int commas = 0, known = 0, n;
     for (at = line; *at; at++) commas += *at == ',';
-    if (commas < 6) return 0;
-    last[1 + strcspn(last + 1, "\r\n")] = 0;
+    if (commas < 7) return 0;
+    /* Counted from the end, for the name of a lead may hold commas. */
+    strange = strrchr(line, ',');
+    *strange++ = 0;
+    strange[strcspn(strange, "\r\n")] = 0;
+    known_s = strrchr(line, ',') + 1;
     *kind++ = 0;
     kind[strcspn(kind, ",")] = 0;
     for (n = 0; n < 3; n++) known = known || !strcmp(kind, kinds[n]);
     found->r_s = number(line);
-    found->strange = !strcmp(kind, "ectopic");
-    found->known_s = number(last + 1);
+    found->strange = !strcmp(strange, "1");
+    found->known_s = number(known_s);
+    known = known && (found->strange || !strcmp(strange, "0"));
     return known && isfinite(found->r_s) && isfinite(found->known_s) && found->known_s >= found->r_s;
 }
 
@@ -67,9 +72,10 @@ static int next_peak(peak_table *table, peak *found)
     if (is_peak(line, found)) return 1;
     table->broken = 1;
     fprintf(stderr,
-            "error: %s, line %ld: is no row of `beatfield rpeaks`: it needs seven columns, the "
-            "first the R time in seconds, the second normal, ectopic or irregular, the last when "
-            "the beat was known, at its R time or later; write the table again\n",
+            "error: %s, line %ld: is no row of `beatfield rpeaks`: it needs eight columns, the "
+            "first the R time in seconds, the second normal, ectopic or irregular, the last two when "
+            "the beat was known, at its R time or later, and 1 if its shape is unlike the others', "
+            "or 0; write the table again\n",
             table->path, table->line);
     return 0;
 }

@@ -29,14 +29,20 @@ def map_phase(array: Path, index: int, grid: Grid) -> Float32:
     Raises
     ------
     InputError
-        When the file is missing or its size is wrong.
+        When the file is missing, also where its field is just being replaced, or its size is wrong.
     """
     path = chunk_path(array, index)
     size, needed = _size(path), 4 * int(np.prod(grid.shape))
     if size != needed:
         raise InputError(f"{path}: {size} bytes, {needed} were needed; bake the field again")
+    try:
+        mapped = np.memmap(path, dtype="<f4", mode="r", shape=grid.shape)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be mapped ({error}); if the field was just replaced, open it again"
+        ) from error
     # A plain view: subclasses of arrays make every call into a compiled kernel slower.
-    return np.asarray(np.memmap(path, dtype="<f4", mode="r", shape=grid.shape))
+    return np.asarray(mapped)
 
 
 def readable_in_fours(coefficients: Float32) -> Float32:

@@ -7,7 +7,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from pipeline.geometry import Float, Integer, Surface
+from pipeline.geometry import Float, Integer, Mask, Surface
 
 GAP = 1.5
 """A step longer than so many mean ones is a gap in the phases: no spline knows the way through it.
@@ -75,10 +75,11 @@ def _led_across_gaps(phases: Float) -> tuple[Float, Float]:
     A spline through places that are a little off swings the wider the longer it is left alone.
     """
     steps, one_by_one = np.diff(phases), np.eye(len(phases) - 1)
+    apart = is_gap(steps)
     rows = np.vstack([one_by_one, one_by_one[:1]])
     at, through = [phases[:1]], [rows[:1]]
     for k, step in enumerate(steps):
-        parts = max(1, round(step / steps.mean())) if step > GAP * steps.mean() else 1
+        parts = max(1, round(step / steps.mean())) if apart[k] else 1
         share = np.arange(1, parts + 1)[:, None] / parts
         at.append(phases[k] + share[:, 0] * step)
         through.append((1 - share) * rows[k] + share * rows[k + 1])
@@ -91,6 +92,13 @@ def between(phases: Float, count: int) -> Float:
     return np.asarray(phases[:, None] + steps * np.arange(count)).ravel()
 
 
+def is_gap(steps: Float) -> Mask:
+    """Which of the steps ``(n,)`` between phases that follow one another are gaps."""
+    return np.asarray(steps > GAP * steps.mean())
+
+
 def halfway(phases: Float) -> Float:
-    """Moments in the middle between stored phases, the last with the first of the next beat."""
-    return np.asarray(phases + np.diff(phases, append=phases[0] + 1) / 2)
+    """Moments in the middle between stored phases, the last with the first of the next beat; none
+    in a gap."""
+    steps = np.diff(phases, append=phases[0] + 1)
+    return np.asarray((phases + steps / 2)[~is_gap(steps)])

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pipeline.field.motion import BeatingSurface, Motion, between
+from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
 from pipeline.field.spline import phase_weights, timeline
 from pipeline.geometry import (
     Float,
@@ -109,7 +109,8 @@ def fit_to_surface(
 
 def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[tuple[float, Float]]:
     """Moments and ``(n, 3)`` points: those of stored phases, and where vertices correspond the
-    same material points between them."""
+    same material points between them, but in no gap: what a spline of few phases cannot follow
+    there, it would make up for at the phases beside it."""
     step_mm = min(grid.spacing_mm)
     motion = Motion.of(moving)
     if motion is None:
@@ -118,7 +119,9 @@ def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[tuple
             yield phase, _carried(surface, *_spread_over(surface, step_mm))
         return
     corners, shares = _spread_over(moving.at(0), step_mm)
-    for phase in between(phases, MOMENTS_A_PHASE).tolist():
+    moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
+    moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
+    for phase in moments[np.isfinite(moments)].tolist():
         yield phase, _carried(motion.at(phase), corners, shares)
 
 

@@ -18,7 +18,7 @@ from pipeline.registration.rpeaks import Beat, RPeakDetector, with_end_held
 NOMINAL_RR_S = 0.8
 # How often the clock is asked: often enough to see a lead come off for less than a beat.
 _STEP_S = 0.02
-_COLUMNS = ("time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s")
+_COLUMNS = ("time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s", "strange")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,9 @@ class RhythmBeat:
 
     known_s: float
     """When it became known."""
+
+    strange: bool
+    """Whether its shape is unlike the others', as a clock must be told."""
 
 
 def read_rhythm(signal_mv: Float, sampling_rate_hz: float) -> list[RhythmBeat]:
@@ -100,7 +103,8 @@ def tell(clock: PhaseClock, beat: Beat) -> Kind | None:
 
 
 def _row(beat: Beat, kind: Kind, valid: bool, rr_s: float) -> RhythmBeat:
-    return RhythmBeat(beat.time_s, kind, valid, beat.lead, rr_s, beat.likeness, beat.known_s)
+    told = beat.lead, rr_s, beat.likeness, beat.known_s, beat.strange
+    return RhythmBeat(beat.time_s, kind, valid, *told)
 
 
 def doubt(beats: Sequence[RhythmBeat]) -> str:
@@ -161,4 +165,5 @@ def _cells(one: RhythmBeat, leads: Sequence[str], start_s: float) -> list[str]:
         rr_s,
         f"{one.likeness:.3f}",
         f"{one.known_s + start_s:.5f}",
+        "1" if one.strange else "0",
     ]
