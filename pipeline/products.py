@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.errors import InputError
 from pipeline.geometry import Float, Label, MovingSurface, Surface
 from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.labels import LABELS
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import LPS_FROM_RAS, read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
@@ -96,8 +98,25 @@ def write_labels(folder: Path, stem: str, labels: Label, mr_from_index: Float) -
 
 
 def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
-    """``(phase, z, y, x)`` labels and ``mr_from_index``."""
-    volumes = [read_image(path) for path in sorted(folder.glob(f"{stem}_*.nii.gz"))]
+    """``(phase, z, y, x)`` labels and ``mr_from_index``.
+
+    Raises
+    ------
+    InputError
+        When there are none, or a file holds what is no label.
+    """
+    paths = sorted(folder.glob(f"{stem}_*.nii.gz"))
+    if not paths:
+        raise InputError(f"{folder}: holds no {stem}_000.nii.gz ...; give the labels of each phase")
+    volumes = [read_image(path) for path in paths]
+    for path, (volume, _) in zip(paths, volumes, strict=True):
+        others = np.setdiff1d(np.unique(volume), [0, *LABELS.values()])
+        if len(others):
+            known = ", ".join(f"{value} {name}" for name, value in LABELS.items())
+            raise InputError(
+                f"{path}: holds {others[0]:g}, which is no label; labels are whole numbers: "
+                f"0 background, {known}"
+            )
     return np.stack([np.asarray(volume, np.uint8) for volume, _ in volumes]), volumes[0][1]
 
 

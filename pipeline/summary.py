@@ -80,27 +80,26 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
     }
     ingest, segment = figures.get("ingest", {}), figures.get("segment", {})
     return [
-        *_timing(ingest),
+        *[("timing", text) for text in of_timing(ingest)],
         *[("input", text) for text in ingest.get("remarks", [])],
         *_drawn_between(ingest),
         *_series_left_out(ingest),
         *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
         *_orientation(segment),
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
+        *[("cut off", text) for text in cut_sideways_by(segment.get("cut_sideways", {}), ingest)],
         *[("doubtful", text) for text in doubts(segment, figures.get("surface", {}))],
         *_left_out(figures),
     ]
 
 
-def _timing(ingest: dict[str, Any]) -> list[tuple[str, str]]:
+def of_timing(ingest: dict[str, Any]) -> list[str]:
+    """A sentence where nothing tells when two phases are."""
     if not str(ingest.get("timing_source", "")).startswith("NIfTI") or ingest["phases"] > 2:
         return []
     return [
-        (
-            "timing",
-            f"two phases evenly over a beat of {ingest['rr_s']:g} s, for the header's time step is "
-            "all that tells; write timing.json if that is not so",
-        )
+        f"two phases evenly over a beat of {ingest['rr_s']:g} s, for the header's time step is "
+        "all that tells; write timing.json if that is not so"
     ]
 
 
@@ -144,6 +143,15 @@ def cut_off_by(cut_off: dict[str, dict[Any, int]], ingest: dict[str, Any]) -> li
     return [
         f"{', '.join(body.partition(':')[0] for body in bodies)} {place}: surfaces and volumes "
         "end there"
+        for place, bodies in by_reason(places).items()
+    ]
+
+
+def cut_sideways_by(cut: dict[str, int], ingest: dict[str, Any]) -> list[str]:
+    """Sentences on the structures that end where the images do at their sides."""
+    places = {body: f"in {phases} of {ingest['phases']} phases" for body, phases in cut.items()}
+    return [
+        f"{', '.join(bodies)} at the images' edge {place}: surfaces and volumes end there"
         for place, bodies in by_reason(places).items()
     ]
 

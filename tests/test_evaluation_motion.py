@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import SimpleITK
 from scipy.integrate import quad
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.evaluation.metrics import pooled_dice
 from pipeline.evaluation.motion import material_points, motion_error
 from pipeline.geometry import Float, MovingSurface, Surface
+from pipeline.imaging.labels import LABELS
+from pipeline.imaging.nifti import write_image
 from pipeline.job import Job
-from pipeline.products import write_labels, write_surfaces, write_table
+from pipeline.products import read_labels, write_labels, write_surfaces, write_table
 from pipeline.stages import evaluate
 
 RADIUS_MM = 30.0
@@ -225,6 +229,17 @@ def test_the_stage_measures_what_was_put_there(job: Job) -> None:
     assert metrics["lv_mass_g"] == {"found": 102.0, "truth": 100.0}
 
 
+def test_what_truth_never_shows_is_not_held_against_labels(job: Job) -> None:
+    """As of truth drawn by hand, which has no atria."""
+    labels, mr_from_index = read_labels(job.products / "segment", "labels")
+    labels[:, 2] = LABELS["left_atrium"]
+    write_labels(job.products / "segment", "labels", labels, mr_from_index)
+    evaluate.run(job)
+    metrics = json.loads((job.folder / "metrics.json").read_text())
+    assert metrics["slice_dice"] == [[1.0, 1.0, None], [1.0, round(2 * 8 / 24, 4), None]]
+    assert metrics["labels_without_truth"] == [name for name, value in LABELS.items() if value > 1]
+
+
 def test_truth_of_another_cine_is_refused(job: Job) -> None:
     assert job.study.truth is not None
     write_labels(job.study.truth, "labels", np.zeros((2, 4, 8, 8), np.uint8), np.eye(4))
@@ -276,3 +291,26 @@ def test_phases_that_are_off_by_a_frame_are_not_those_of_the_truth(job: Job) -> 
     write_table(job.products / "ingest" / "phases.json", {"phases": (PHASES + 0.03).tolist()})
     with pytest.raises(InputError, match="its phases are not those of the cine"):
         evaluate.run(job)
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.999999, 2.0), (0.0, 257.0, 2.0), (0.0, 9.0, 2.0)])
+def test_truth_that_holds_no_labels_is_refused(tmp_path: Path, values: tuple[float, ...]) -> None:
+    volume = np.resize(np.array(values, np.float32), (3, 4, 5))
+    write_image(tmp_path / "labels_000.nii.gz", volume, np.diag([1.5, 1.5, 8, 1]))
+    with pytest.raises(InputError, match=r"labels_000\.nii\.gz: holds .*, which is no label"):
+        read_labels(tmp_path, "labels")
+    with pytest.raises(InputError, match=r"holds no heart_000\.nii\.gz"):
+        read_labels(tmp_path, "heart")
+
+
+def test_what_is_written_opens_elsewhere_however_its_axes_are_rounded(tmp_path: Path) -> None:
+    """ITK takes no affine whose axes lean by more than 1e-4, and 3 decimals make them lean more."""
+    turn = Rotation.from_rotvec([0.5, -0.4, 0.7]).as_matrix()
+    affine = np.eye(4)
+    affine[:3, :3] = np.round(turn, 3) * [1.4, 1.4, 8.0]
+    axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
+    assert 2e-4 < np.abs(axes.T @ axes - np.eye(3)).max() < 1e-3
+    write_image(tmp_path / "image.nii.gz", np.zeros((4, 5, 6), np.uint8), affine)
+    image = SimpleITK.ReadImage(str(tmp_path / "image.nii.gz"))
+    far = image.TransformContinuousIndexToPhysicalPoint((5.0, 4.0, 3.0))
+    np.testing.assert_allclose(far, affine[:3, :3] @ [5, 4, 3], atol=0.02)

@@ -62,7 +62,7 @@ def test_doubts_and_corrections_stand_at_the_top(figures: dict[str, Any], told: 
 def opening(us: object, verdict: str | None, doubtful: bool, truth: bool) -> Opening:
     """Of a study whose other stages found nothing amiss, or a slice of low confidence."""
     figures: dict[str, Any] = {
-        "segment": {"orientation": str(AS_THE_FILE_SAYS), "cut_off": {}},
+        "segment": {"orientation": str(AS_THE_FILE_SAYS), "cut_off": {}, "cut_sideways": {}},
         "ingest": {"remarks": [], "interpolated_slices": [3] if doubtful else [], "phases": 9},
         "surface": {"left_out": {}},
         "bake": {"left_out": {}},

@@ -15,12 +15,12 @@ from pipeline.errors import StageError
 from pipeline.imaging import confidence
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import (
     _require_cavity,
     _require_right_ventricle,
-    cut_off,
     missed_hearts,
     segment_cine,
 )
@@ -361,3 +361,18 @@ def test_a_heart_is_missed_between_two_and_not_above_stray_pixels():
     assert not len(missed_hearts(drawn, 1.5))
     drawn[1, 0, 15:25, 15:25] = LABELS["lv_cavity"]
     np.testing.assert_array_equal(missed_hearts(drawn, 1.5), [[1, 1]])
+
+
+@pytest.mark.parametrize("blanked", [False, True])
+@pytest.mark.parametrize(("place", "cut"), [(32, False), (11, False), (7, True), (4, True)])
+def test_what_the_images_edge_cuts_off_is_told(blanked, place, cut):
+    """A disc of 8 pixels, so far from the edge, in images that end there or are black beyond."""
+    rng = np.random.default_rng(0)
+    intensity = rng.rayleigh(50.0, (2, 3, 64, 64)).astype(np.float32)
+    row, column = np.mgrid[:64, :64]
+    labels = np.zeros((2, 3, 64, 64), np.uint8)
+    labels[0, 1, np.hypot(row - 32, column - place) < 8] = LABELS["rv_cavity"]
+    if blanked:
+        labels, intensity = (np.roll(one, 20, axis=3) for one in (labels, intensity))
+        intensity[..., :20] = labels[..., :20] = 0
+    assert cut_sideways(labels, intensity) == ({"right ventricle": 1} if cut else {})

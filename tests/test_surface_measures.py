@@ -7,14 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.geometry import Float, MovingSurface
+from pipeline.geometry import Float, MovingSurface, Surface
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.measures import (
+    base_direction,
     ejection_fraction,
     end_systole,
     measures,
     segment_names,
 )
+from pipeline.surface.mesh import vertex_areas
 
 PHASES = np.array([0.0, 0.4])
 INNER_MM, OUTER_MM = (25.0, 20.0), (33.0, 31.0)
@@ -201,3 +203,29 @@ def test_levels_are_thirds_of_the_length():
     names = segment_names(inner, walled, POLE, None)
     for name, low, high in (("apical", 0.1, 1 / 3), ("mid", 1 / 3, 2 / 3), ("basal", 2 / 3, 1)):
         assert set(names[walled & (share > low + 1e-6) & (share < high - 1e-6)]) == {name}
+
+
+def test_in_a_mirror_image_anterior_and_inferior_keep_their_places():
+    flip = np.diag([1.0, -1.0, 1.0])
+    turned = {
+        name: MovingSurface(moving.vertices_mm @ flip, moving.triangles[:, ::-1], moving.phases)
+        for name, moving in SURFACES.items()
+    }
+    found = measures(turned, mirrored=True)["lv_wall_thickness_mm"]["segments"]
+    for name, expected in measures(SURFACES)["lv_wall_thickness_mm"]["segments"].items():
+        np.testing.assert_allclose(found[name], expected, atol=0.02)
+
+
+def test_a_thin_scar_does_not_turn_the_axis():
+    """Of 8 mm of wall 2 are left over a part of it of two thirds of the area of the lid."""
+    inner, outer = (SURFACES[name].at(0) for name in ("lv_endocardium", "epicardium"))
+    points = inner.vertices_mm
+    outwards = points / np.maximum(np.linalg.norm(points, axis=1), 1e-9)[:, None]
+    scarred = (outwards @ ANTERIOR > 0.2) & (points @ POLE < -2)
+    thinned = Surface(points + 6 * scarred[:, None] * outwards, inner.triangles)
+    areas = vertex_areas(points, inner.triangles)
+    assert areas[scarred].sum() > 0.65 * areas[points @ POLE > -1e-6].sum()
+    for shape in (inner, thinned):
+        axis = base_direction(shape, outer)
+        assert axis is not None
+        assert np.degrees(np.arccos(min(axis @ POLE, 1))) < 3

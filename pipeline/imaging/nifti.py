@@ -80,6 +80,8 @@ def write_image(
         From phase to phase, on average; None where there are none, or it is not known.
     """
     image = nibabel.Nifti1Image(array.T, LPS_FROM_RAS @ mr_from_index)
+    # Programs that take no affine whose axes lean by a trifle, as of rounded ones, take this.
+    image.set_qform(image.affine, code=1)
     image.header.set_xyzt_units("mm", "sec")
     if array.ndim == 4:
         image.header["pixdim"][4] = step_s or 0.0

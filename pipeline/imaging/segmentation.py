@@ -14,6 +14,7 @@ from pipeline.imaging.alignment import slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.cut_off import BODIES
 from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
@@ -62,24 +63,6 @@ spoilt."""
 LEAST_SHARED_MM2 = 100.0
 """What both neighbours show in one place is no more than stray pixels beyond the tip if it is less:
 a cut 11 mm wide."""
-
-
-BODIES: dict[str, tuple[str, ...]] = {
-    "left ventricle": ("lv_cavity", "lv_myocardium"),
-    "right ventricle": ("rv_cavity",),
-    "left atrium": ("left_atrium",),
-    "right atrium": ("right_atrium",),
-    "aorta": ("aorta",),
-}
-"""What a stack may cut off, by name for people."""
-
-LEAST_CUT = 0.1
-"""A smaller share of a body's largest cut, on the outermost slice, is its tip."""
-
-GOES_ON, BLUNT = 2 / 3, 0.9
-"""Shares of the cut before it that the outermost slice shows of a body that goes on. A paraboloid's
-cuts fall in a straight line: two thirds are left two slices from its end. A tip is blunter, but of
-40 whole stacks one alone showed more than 0.61 in the median phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,27 +357,3 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
             chance: Float32 = np.stack([carried[0] + 2, *carried[1:]])
             labels[phase, z] = most_probable(chance, axis=0)
     return labels
-
-
-def cut_off(labels: Label) -> dict[str, dict[int, int]]:
-    """Where the stack's ends cut structures off: ``{body: {slice: phases in which it goes on}}``.
-
-    A body goes on beyond the outermost slice where its cut there is more than `GOES_ON` of the one
-    before: it would end some two slices farther. It is told where it does in half of the phases,
-    for a tip comes and goes with noise, or leaves the stack with hardly a smaller cut in any.
-
-    Parameters
-    ----------
-    labels
-        ``(phase, z, y, x)`` on the cine's slices.
-    """
-    found: dict[str, dict[int, int]] = {}
-    last = labels.shape[1] - 1
-    for body, names in BODIES.items():
-        area = np.isin(labels, [LABELS[name] for name in names]).sum(axis=(2, 3))
-        for end, inner in ((0, 1), (last, last - 1)):
-            share = area[:, end] / np.maximum(area[:, inner], 1)
-            share[area[:, end] < LEAST_CUT * area.max()] = 0
-            if (share > GOES_ON).mean() >= 0.5 or share.max() > BLUNT:
-                found.setdefault(body, {})[end] = int((share > GOES_ON).sum())
-    return found

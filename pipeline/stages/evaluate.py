@@ -53,12 +53,16 @@ def run(job: Job) -> dict[str, Any]:
         raise InputError(f"{truth}/truth.json: its phases are not those of the cine")
     surfaces = read_surfaces(job.products / "surface", phases)
     found, known_labels = _labels(job, truth)
+    shown = [name for name, value in LABELS.items() if (known_labels == value).any()]
+    # Truth that has no atria, as of most people who draw by hand, says nothing of them.
+    found = np.where(np.isin(found, [LABELS[name] for name in shown]), found, 0)
     metrics: dict[str, Any] = {
         "structures": _structures(job, truth, surfaces, _overlap(found, known_labels)),
         "lv_ejection_fraction": _ejection_fractions(surfaces, known, "lv_endocardium"),
         "rv_ejection_fraction": _ejection_fractions(surfaces, known, "rv_endocardium"),
         "lv_mass_g": _masses(job, known),
         "slice_dice": _rounded(pooled_dice(found, known_labels)),
+        "labels_without_truth": [name for name in LABELS if name not in shown],
     }
     if job.product("register"):
         metrics |= _registration(job, truth, known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,15 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
 from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
-from pipeline.summary import by_reason, clock_put_right, cut_off_by, doubts, series_left_out
+from pipeline.summary import (
+    by_reason,
+    clock_put_right,
+    cut_off_by,
+    cut_sideways_by,
+    doubts,
+    of_timing,
+    series_left_out,
+)
 
 ULTRASOUND_FRAMES_SHOWN = 4
 BLOOD_TOLD = (
@@ -92,7 +100,7 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
             f"{ingest['slices']} slices, {ingest['phases']} phases, {ingest['timing_source']}",
         ),
         ("heart rate", f"{60 / ingest['rr_s']:.0f} beats/min"),
-        *_of_whole_ventricles(heart.function_rows(measures), job.figures("segment")["cut_off"]),
+        *_of_whole_ventricles(heart.function_rows(measures), _cut(job)),
         (
             "lowest confidence of the labels",
             f"{lowest_place(confidence)}; doubtful below {LOW_CONFIDENCE:.2f}",
@@ -112,10 +120,16 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     return rows
 
 
+def _cut(job: Job) -> set[str]:
+    """Names of what ends where the images do."""
+    figures = job.figures("segment")
+    return {*figures["cut_off"], *figures["cut_sideways"]}
+
+
 def _of_whole_ventricles(
-    rows: list[tuple[str, str]], cut_off: Mapping[str, Any]
+    rows: list[tuple[str, str]], cut_off: Collection[str]
 ) -> list[tuple[str, str]]:
-    """The figures of function, with a word beside those of a ventricle that the stack cuts off."""
+    """The figures of function, with a word beside those of a ventricle that the images cut off."""
     cut = {name for name in ("left", "right") if f"{name} ventricle" in cut_off}
     short = tuple({"left": "LV", "right": "RV"}[name] for name in cut)
     return [
@@ -156,6 +170,7 @@ def _warnings(job: Job) -> list[str]:
         )
     ingest = job.figures("ingest")
     of_ultrasound = job.figures("register")["remarks"] if job.product("register") else []
+    notes += [f"Of the timing: {text}." for text in of_timing(ingest)]
     notes += [f"Of the input: {text}." for text in (*ingest["remarks"], *of_ultrasound)]
     missing = ingest["interpolated_slices"]
     if missing:
@@ -165,6 +180,8 @@ def _warnings(job: Job) -> list[str]:
     notes += [f"Doubtful {text}." for text in told]
     for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
+    for text in cut_sideways_by(job.figures("segment")["cut_sideways"], ingest):
+        notes.append(f"Cut off: {text}.")
     for why, names in by_reason(job.figures("surface")["left_out"]).items():
         notes.append(f"No surface of {', '.join(names).replace('_', ' ')}: {why}.")
     for name, why in job.figures("bake")["left_out"].items():

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import cut_off, segment_cine
+from pipeline.imaging.segmentation import segment_cine
 from pipeline.job import Job
 from pipeline.products import read_cine, read_long_axis, write_labels, write_table
 
@@ -34,6 +35,7 @@ def run(job: Job) -> dict[str, Any]:
         "lowest_confidence": round(float(found.confidence[lowest]), 3),
         "least_certain": {"phase": int(lowest[0]), "slice": int(lowest[1])},
         "cut_off": cut_off(found.labels),
+        "cut_sideways": cut_sideways(found.labels, cine.intensity),
         "orientation": str(found.orientation),
         "mirror_image": found.orientation.is_mirror_image,
         "volumes_ml": volumes,

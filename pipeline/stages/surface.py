@@ -20,7 +20,7 @@ def run(job: Job) -> dict[str, Any]:
     phases, rr_s = np.array(cycle["phases"]), float(cycle["rr_s"])
     found = extract(heart, mr_from_index, phases, job.settings.surface, job.progress)
     write_surfaces(job.folder, found.surfaces)
-    table = measures(found.surfaces)
+    table = measures(found.surfaces, job.figures("segment")["mirror_image"])
     write_table(job.folder / "measures.json", table)
     cavity_ml = np.array(table["volumes_ml"]["lv_endocardium"])
     return _headline(table) | {

@@ -38,6 +38,8 @@ MUSCLE_G_ML = 1.05
 LID_MM = 2.5
 # The lid looks along the axis, within 60 degrees, and lies this near its own height.
 LID_FACING, LID_HEIGHT_MM = 0.5, 5.0
+# What looks less than 20 degrees away belongs to one lid; so many directions are tried.
+LID_FLAT, TRIED = 0.94, 300
 # Share of the cavity's length below which a wall belongs to the apical cap.
 APEX_SHARE = 0.1
 RING = ("anteroseptal", "anterior", "anterolateral", "inferolateral", "inferior", "inferoseptal")
@@ -56,7 +58,7 @@ AHA_APICAL_RING = ("anterior", "septal", "inferior", "lateral")
 Names = npt.NDArray[np.str_]
 
 
-def measures(surfaces: Mapping[str, MovingSurface]) -> dict[str, Any]:
+def measures(surfaces: Mapping[str, MovingSurface], mirrored: bool = False) -> dict[str, Any]:
     """Table of volumes, ejection fractions, mass and wall thickness; see the module's text.
 
     Parameters
@@ -64,11 +66,13 @@ def measures(surfaces: Mapping[str, MovingSurface]) -> dict[str, Any]:
     surfaces
         Closed surfaces by name, LPS mm, of the same phases; ``lv_endocardium`` and ``epicardium``
         must be there.
+    mirrored
+        Whether they are a mirror image of the heart, as of slices stored in the wrong order.
     """
     volumes = {name: volumes_ml(moving) for name, moving in surfaces.items()}
     inner, right = surfaces["lv_endocardium"], surfaces.get("rv_endocardium")
     muscle_ml = volumes["epicardium"] - volumes["lv_endocardium"]
-    mean, segments = wall_thickness_mm(inner, surfaces["epicardium"], right)
+    mean, segments = wall_thickness_mm(inner, surfaces["epicardium"], right, mirrored)
     return {
         "phases": inner.phases.tolist(),
         "end_diastole": int(volumes["lv_endocardium"].argmax()),
@@ -118,7 +122,10 @@ def mean_lv_mass_g(table: Mapping[str, Any]) -> float:
 
 
 def wall_thickness_mm(
-    inner: MovingSurface, outer: MovingSurface, right: MovingSurface | None
+    inner: MovingSurface,
+    outer: MovingSurface,
+    right: MovingSurface | None,
+    mirrored: bool = False,
 ) -> tuple[Float, dict[str, Float]]:
     """Thickness ``(phase,)`` of the left wall in mm: mean, and by segment.
 
@@ -134,7 +141,7 @@ def wall_thickness_mm(
     names = np.full(len(weights), "")
     if axis is not None:
         walled = ~on_lid(first, axis)
-        names = segment_names(first, walled, axis, right.at(0) if right else None)
+        names = segment_names(first, walled, axis, right.at(0) if right else None, mirrored)
     thickness = np.stack(
         [_to_wall(inner.vertices_mm[k], outer.at(k), axis) for k in range(len(inner.phases))]
     )
@@ -146,12 +153,17 @@ def wall_thickness_mm(
 def base_direction(inner: Surface, outer: Surface) -> Float | None:
     """Unit vector ``(3,)`` from apex to base: the mean normal of the lid; None without a lid.
 
-    The lid is where the cavity's surface touches the outer one.
+    The lid is where the cavity's surface touches the outer one, and is flat: a scar so thin that
+    it seems to touch, too, is curved, and most of what touches looks the lid's way.
     """
     touching = distances_mm(inner.vertices_mm, outer) < LID_MM
+    if not touching.any():
+        return None
     areas = vertex_areas(inner.vertices_mm, inner.triangles)
     normals = vertex_normals(inner.vertices_mm, inner.triangles)
-    mean = (areas * touching) @ normals
+    tried = normals[touching][:: max(1, int(touching.sum()) // TRIED)]
+    alike = (normals @ tried.T > LID_FLAT) * (areas * touching)[:, None]
+    mean = alike[:, alike.sum(axis=0).argmax()] @ normals
     # A ring of thin wall looks in all directions; a lid looks in one.
     if np.linalg.norm(mean) < 0.02 * areas.sum():
         return None
@@ -171,12 +183,14 @@ def on_lid(surface: Surface, axis: Float) -> Mask:
     return np.asarray(upper & (height > lid_height - LID_HEIGHT_MM))
 
 
-def segment_names(inner: Surface, walled: Mask, axis: Float, right: Surface | None) -> Names:
+def segment_names(
+    inner: Surface, walled: Mask, axis: Float, right: Surface | None, mirrored: bool = False
+) -> Names:
     """Name ``(n,)`` of the segment of each vertex of the cavity's surface; "" on the lid.
 
     Basal, mid and apical are thirds of the cavity's length along its axis, the apex the lowest
     tenth. The septum's middle looks at the centre of the right ventricle; seen from the apex the
-    anterior wall follows clockwise, at axis x septum.
+    anterior wall follows clockwise, at axis x septum, but in a mirror image.
     """
     points = inner.vertices_mm - np.average(
         inner.vertices_mm, axis=0, weights=vertex_areas(inner.vertices_mm, inner.triangles)
@@ -189,7 +203,8 @@ def segment_names(inner: Surface, walled: Mask, axis: Float, right: Surface | No
         centre = right.vertices_mm.mean(axis=0) - inner.vertices_mm.mean(axis=0)
         septum = centre - (centre @ axis) * axis
         septum /= np.linalg.norm(septum)
-        degrees = np.degrees(np.arctan2(points @ np.cross(axis, septum), points @ septum)) % 360
+        anterior = np.cross(axis, septum) * (-1 if mirrored else 1)
+        degrees = np.degrees(np.arctan2(points @ anterior, points @ septum)) % 360
         six = np.array(RING)[(degrees // 60).astype(int) % 6]
         four = np.array(APICAL_RING)[((degrees + 45) // 90).astype(int) % 4]
         around = np.where(level == "apical", four, six)
