@@ -18,7 +18,7 @@ from pipeline import __version__
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.field.bake import SurfaceSeries, bake_field
-from pipeline.field.certificate import certify, require_bounds
+from pipeline.field.certificate import BAND_MM, certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.files import read_metadata
 from pipeline.field.fixture import BakeSettings, Bounds, Fixture
@@ -114,11 +114,12 @@ def bake_own_surfaces(
 def what_was_baked(field: Path) -> list[str]:
     """How exact a field is, and what its fixtures do: some may be defaults that nobody wrote."""
     baked = ForceField.open(field)
-    off_mm = baked.accuracy["surface_error_p99_mm"]
+    off_mm, about_mm = (baked.accuracy[f"{name}_error_p99_mm"] for name in ("surface", "distance"))
     count = len(baked.phases)
     return [
         f"phases    {count}{', so nothing moves' if count == 1 else ''}",
-        f"accuracy  {off_mm:.2g} mm off on the surfaces at most, in 99 places of 100",
+        f"accuracy  {off_mm:.2g} mm off on the surfaces at most and {about_mm:.2g} mm within "
+        f"{BAND_MM:g} mm of them, in 99 places of 100",
     ] + [
         f"fixture   {name}: {one.kind.replace('_', ' ')}{f' {one.side}' if one.side else ''} of "
         f"{one.structure}, {one.f_max_n:g} N at most, next to nothing within "
