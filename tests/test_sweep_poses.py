@@ -197,6 +197,16 @@ def test_a_pose_of_zeros_is_none(tmp_path):
     assert remarks_on([sweep]) == [f"s: {sweep.remarks[0]}"]
 
 
+@pytest.mark.parametrize(("wider", "told"), [(1.0, 0), (0.98, 0), (1.1, 1), (0.91, 1)])
+def test_pixels_that_are_not_square_are_told(tmp_path, wider, told):
+    """No pose and no size of the heart tells that a picture is calibrated too wide."""
+    given = calibration() @ np.diag([wider, 1, 1, 1])
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", good_fields()),
+                                 probe_from_image=given.tolist()))  # fmt: skip
+    assert len(sweep.remarks) == told
+    assert all("pixels are" in one and "square" in one for one in sweep.remarks)
+
+
 def test_the_identity_is_no_pose_but_of_a_probe_that_rests_there(tmp_path):
     """As some recorders write for a tool unseen; a pose that was measured is never exact."""
     place = "Seq_Frame{:04d}_ProbeToTrackerTransform"
