@@ -29,7 +29,7 @@ from pipeline.registration.uncertainty import (
     motion_between,
     sandwich,
 )
-from pipeline.registration.verdict import Evidence, judge, outvoted
+from pipeline.registration.verdict import Evidence, judge, longest_astray, outvoted
 
 PIVOT = Pivot(np.array([10.0, -20.0, 30.0]), 40.0)
 BENDING = np.diag([2.0, 3.0, 1.0, 1.5, 0.5, 4.0]) + 0.2
@@ -305,3 +305,27 @@ def test_six_fitted_parameters_are_taken_off_the_frames():
     # Frames of sweeps of their own: slopes' squares add up to 2, and 12 frames leave 6 free.
     found = sandwich(Curvature(slopes, np.eye(6)), np.arange(12))
     np.testing.assert_allclose(found, 4 * np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("fits", "expected"),
+    [
+        ("1111|1111", (0, 0)),
+        ("1011|1001", (2, 2)),
+        # A run ends where its sweep does.
+        ("1100|0011", (2, 2)),
+        ("0001|1000", (3, 2)),
+        ("0000|1111", (4, 1)),
+    ],
+)
+def test_frames_in_a_row_that_go_astray_are_counted_within_a_sweep(fits, expected):
+    one, two = fits.split("|")
+    sweep = np.repeat([0, 1], [len(one), len(two)])
+    assert longest_astray(sweep, np.array([part == "1" for part in one + two])) == expected
+
+
+def test_ten_frames_in_a_row_that_go_astray_put_a_result_in_doubt():
+    assert judge(Evidence(**(SOUND | {"astray": (9, 2)})), RegisterSettings()).grade == "good"
+    said = judge(Evidence(**(SOUND | {"astray": (10, 2)})), RegisterSettings())
+    assert said.grade == "doubtful"
+    assert "10 frames in a row of sweep 2 show the heart" in said.reason

@@ -38,7 +38,14 @@ from pipeline.registration.uncertainty import (
     in_radians,
     sandwich,
 )
-from pipeline.registration.verdict import Evidence, Grade, Verdict, judge, outvoted
+from pipeline.registration.verdict import (
+    Evidence,
+    Grade,
+    Verdict,
+    judge,
+    longest_astray,
+    outvoted,
+)
 
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
@@ -384,10 +391,18 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
     shift_mm, turn_deg = (
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
-    sure, valid = (found.confidence, found.rival), int(found.bears_out.sum())
-    against = outvoted(level.samples.sweep(sizes), found.bears_out, settings.min_frames)
-    # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
-    shown = level.samples.frames
-    travelled = shift_mm, turn_deg
-    evidence = Evidence(*sure, expected_mm, valid, shown, *travelled, against, found.size)
+    sweep, shows = level.samples.sweep(sizes), level.at(found.pose).in_view > LEAST_IN_VIEW
+    evidence = Evidence(
+        confidence=found.confidence,
+        rival=found.rival,
+        expected_mm=expected_mm,
+        valid=int(found.bears_out.sum()),
+        # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
+        frames=level.samples.frames,
+        shift_mm=shift_mm,
+        turn_deg=turn_deg,
+        outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
+        size=found.size,
+        astray=longest_astray(sweep[shows], found.bears_out[shows]),
+    )
     return judge(evidence, settings)

@@ -52,6 +52,10 @@ class Evidence:
     size: Size = AS_IT_IS
     """Of the heart that the frames fit best."""
 
+    astray: tuple[int, int] = (0, 0)
+    """The most frames of a sweep in a row that show the heart and do not bear the pose out, and the
+    sweep's number, counted from 1."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -81,6 +85,23 @@ def outvoted(sweep: Integer, bears_out: Mask, least: int) -> tuple[int, ...]:
     if max(shares.values(), default=0.0) < _FOR:
         return ()
     return tuple(number + 1 for number, share in shares.items() if share <= _AGAINST)
+
+
+def longest_astray(sweep: Integer, bears_out: Mask) -> tuple[int, int]:
+    """How many frames of a sweep in a row, at most, do not bear a pose out, and of which sweep,
+    counted from 1.
+
+    Parameters
+    ----------
+    sweep, bears_out
+        ``(frames,)`` in order of time, of frames that show the heart: number of each one's sweep,
+        counted from 0, and whether it bears the pose out.
+    """
+    longest, run = (0, 0), 0
+    for k, (number, fits) in enumerate(zip(sweep.tolist(), bears_out.tolist(), strict=True)):
+        run = 0 if fits else 1 + (run if k and sweep[k - 1] == number else 0)
+        longest = max(longest, (run, number + 1))
+    return longest if longest[0] else (0, 0)
 
 
 def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
@@ -155,6 +176,13 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
             f"few frames of sweep {named} bear out what the others do: where it shows the heart, "
             "one of them lies beside its place, by more than is expected here: look at "
             "calibration, pixel size and whether the patient or the tracker was moved between them"
+        )
+    in_a_row, number = evidence.astray
+    if in_a_row >= settings.min_frames and not evidence.outvoted:
+        reasons.append(
+            f"{in_a_row} frames in a row of sweep {number} show the heart and do not bear out what "
+            "the others do: was the patient, the tracker or the reference moved meanwhile, or the "
+            "depth changed? Cut them off, or record the sweep again"
         )
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
