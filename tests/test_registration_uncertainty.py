@@ -253,12 +253,18 @@ class TestVerdict:
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS}
-        level = SimpleNamespace(samples=samples)
-        found = SimpleNamespace(everything=level, bears_out=borne_out, **sure)
+        in_view = np.ones(40)
+        level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
+        found = SimpleNamespace(everything=level, bears_out=borne_out, pose=None, **sure)
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)
         assert verdict.grade == "doubtful"
         assert "frames of sweep 2 bear out" in verdict.reason
+        verdict = space._verdict(found, search, (40,), 1.0)
+        assert verdict.grade == "doubtful"
+        assert "20 frames in a row of sweep 1" in verdict.reason
+        # A sweep that leaves the heart speaks for itself.
+        in_view[~borne_out] = 0
         assert space._verdict(found, search, (40,), 1.0).grade == "good"
 
     def test_settings_refuse_bounds_that_cross(self):
