@@ -238,10 +238,13 @@ def test_force_on_a_tool_keeps_its_bound(path, watched, name, bound):
             assert found[6] < 2000
 
 
-def test_the_energy_tank_is_pythons(path, watched):
+@pytest.mark.parametrize("unknown", [0.0, 0.2])
+def test_the_energy_tank_is_pythons(path, watched, unknown):
+    """What the hand gave on a way that was not seen, for places are unknown, fills neither."""
     rng = np.random.default_rng(2)
     moves = rng.random((2000, 1)) < 0.7
     points = np.cumsum(moves * rng.normal(scale=0.3, size=(2000, 3)), axis=0)
+    points[rng.random(2000) < unknown] = np.nan
     forces = rng.normal(scale=1.5, size=(2000, 3))
     tank = EnergyTank(3.0, 8.0)
     expected = [(*tank.passed(p, f), tank.level_mj) for p, f in zip(points, forces, strict=True)]
@@ -391,18 +394,3 @@ def test_each_axis_of_an_oblong_grid_ends_where_its_own_nodes_do(tmp_path, progr
     expected = [True] * 3 + [False] * 3
     assert (np.frombuffer(done.stdout) == 1).tolist() == expected
     assert field.contains(points).tolist() == expected
-
-
-def test_the_energy_tank_is_pythons_where_places_are_unknown(path, watched):
-    """What the hand gave on a way that was not seen fills neither."""
-    rng = np.random.default_rng(3)
-    points = np.cumsum(rng.normal(scale=0.3, size=(2000, 3)), axis=0)
-    points[rng.random(2000) < 0.2] = np.nan
-    forces = rng.normal(scale=1.5, size=(2000, 3))
-    tank = EnergyTank(3.0, 8.0)
-    expected = [(*tank.passed(p, f), tank.level_mj) for p, f in zip(points, forces, strict=True)]
-
-    done = run(watched, path, "tank", 3.0, 8.0, given=np.column_stack([points, forces]).tobytes())
-
-    found = np.frombuffer(done.stdout).reshape(-1, 4)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
