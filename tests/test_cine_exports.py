@@ -496,6 +496,16 @@ def of_ge(part: int) -> Callable[[FileDataset], None]:
     return change
 
 
+def test_what_no_vendor_writes_in_its_place_tells_nothing(tmp_path: Path) -> None:
+    def marked(data: FileDataset, number: int, phase: int) -> bool:
+        block = data.private_block(0x0043, "GEMS_PARM_01", create=True)
+        block.add_new(0x2F, "SS", [1, 2])
+        return True
+
+    write_dicom(tmp_path, marked)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
 def of_type(*values: str) -> Callable[[FileDataset], None]:
     def change(data: FileDataset) -> None:
         data.ImageType = ["ORIGINAL", "PRIMARY", *values]

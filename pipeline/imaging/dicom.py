@@ -380,4 +380,6 @@ def _component_of_ge(dataset: Any) -> str | None:
     except KeyError:
         return None
     number = int.from_bytes(value[:2], "little") if isinstance(value, bytes) else value
+    if not isinstance(number, int):
+        return None
     return {1: "phase", 2: "real", 3: "imaginary"}.get(number)
