@@ -410,6 +410,13 @@ def test_segments_in_other_units_or_with_a_gap_are_refused(tmp_path):
         read_ecg(whole)
 
 
+def test_a_length_that_is_no_number_is_refused(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    group.SamplingFrequency = [str(RATE_HZ), str(RATE_HZ)]
+    with pytest.raises(InputError, match="how long its waveforms are cannot be understood"):
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", [group]))
+
+
 def test_of_groups_of_channels_the_longest_of_voltages_is_read(tmp_path):
     """A pressure beside it has more samples."""
     pressure = waveform_group(np.concatenate([STEPS_UV, STEPS_UV])[:, :1], "mm[Hg]")

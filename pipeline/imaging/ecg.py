@@ -177,7 +177,12 @@ def _read_dicom(path: Path) -> Ecg:
     if not groups:
         raise InputError(f"{path}: DICOM without WaveformSequence; it needs an ECG waveform object")
     # Resting ECGs carry the recording and, beside it, a short averaged beat; monitors pressures.
-    longest = max(range(len(groups)), key=lambda index: _seconds(groups[index]))
+    try:
+        longest = max(range(len(groups)), key=lambda index: _seconds(groups[index]))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: how long its waveforms are cannot be understood ({error}); export it again"
+        ) from error
     return _dicom_group(dataset, longest, path)
 
 
