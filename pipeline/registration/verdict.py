@@ -17,6 +17,9 @@ Grade = Literal["good", "doubtful", "failed"]
 # Share of its frames up to which a sweep is against a pose, and from which it is for it.
 _AGAINST, _FOR = 0.25, 0.5
 
+# So many frames in a row that show the heart and do not fit are no chance.
+_IN_A_ROW = 10
+
 # Share of the best score that another pose may reach before the answer is in doubt, or open.
 _DOUBTFUL_RIVAL, _EQUAL_RIVAL = 0.75, 0.9
 
@@ -178,7 +181,7 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
             "calibration, pixel size and whether the patient or the tracker was moved between them"
         )
     in_a_row, number = evidence.astray
-    if in_a_row >= settings.min_frames and not evidence.outvoted:
+    if in_a_row >= _IN_A_ROW and not evidence.outvoted:
         reasons.append(
             f"{in_a_row} frames in a row of sweep {number} show the heart and do not bear out what "
             "the others do: was the patient, the tracker or the reference moved meanwhile, or the "
