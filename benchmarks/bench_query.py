@@ -245,6 +245,6 @@ if __name__ == "__main__":
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         chosen = options.field or Path(place) / "field.zarr"
-        if not chosen.exists():
+        if options.field is None:
             bake_study(chosen, 25)
         print(table(measure(chosen)))

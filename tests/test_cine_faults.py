@@ -161,15 +161,23 @@ def test_slices_out_of_order_are_told_with_their_order(order: list[int]) -> None
     assert told.startswith(f"slices look as if their order were {right};")
 
 
-def test_phases_sorted_by_name_are_told() -> None:
-    cine = beating_ball()
-    (told,) = doubts_of_order(replace(cine, intensity=cine.intensity[by_name(20)]))
+@pytest.mark.parametrize("phases", [*range(12, 16), 20])
+@pytest.mark.parametrize("first", [0, 1])
+def test_phases_sorted_by_name_are_told(phases: int, first: int) -> None:
+    cine = beating_ball(phases)
+    assert doubts_of_order(cine) == ()
+    stored = sorted(range(first, first + phases), key=str)
+    images = cine.intensity[np.array(stored) - first]
+    (told,) = doubts_of_order(replace(cine, intensity=images))
     assert told.startswith("phases look as if their order were 0 ")
+    if phases < 16:
+        order = " ".join(str(stored.index(number)) for number in range(first, first + phases))
+        assert f"were {order};" in told
 
 
-def test_few_phases_and_volumes_are_not_judged() -> None:
+def test_few_phases_in_any_other_order_and_volumes_are_not_judged() -> None:
     cine = beating_ball(phases=12, slices=61)
-    images = cine.intensity[by_name(12)][:, by_name(61)]
+    images = cine.intensity[INTERLEAVED][:, by_name(61)]
     assert doubts_of_order(replace(cine, intensity=images)) == ()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from ellipsoid_heart import moving_surfaces, record, start_off, target_error_mm
@@ -15,6 +16,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.registration import reading
 from pipeline.registration.frames import DisplacedSweep, mirrored, sample_frames
 from pipeline.registration.reading import PIXEL_MM, Reader, as_compared, normalise
+from pipeline.registration.sector import shown_sector
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
 
@@ -149,3 +151,73 @@ def test_transforms_that_are_missing_are_named():
     sweep = record(seed=1, frames=3).sweeps[0]
     with pytest.raises(InputError, match=r"sweep_000: needs images \(n, h, w\)"):
         Reader.of(replace(sweep, tracker_from_image=sweep.tracker_from_image[:2]))
+
+
+def fan(height=180, width=240):
+    """``(h, w)`` mask of a sector of 80 degrees whose tip lies above the picture."""
+    j, i = np.mgrid[:height, :width] - np.array([-15, width / 2])[:, None, None]
+    return (
+        (np.abs(np.arctan2(i, j)) < np.radians(40)) & (np.hypot(i, j) > 25) & (np.hypot(i, j) < 190)
+    )
+
+
+def echoes(sector, frames=12):
+    """Speckle, with a black chamber in the middle and a shadow that is never bright."""
+    rng = np.random.default_rng(4)
+    j, i = np.mgrid[: sector.shape[0], : sector.shape[1]]
+    mean = np.where(np.hypot(i - 120, j - 100) < 30, 0.0, 60.0)
+    mean[:, 150:165] *= 0.2
+    shown = rng.rayleigh(mean, size=(frames, *sector.shape)) * sector
+    return np.clip(shown, 0, 255).astype(np.uint8)
+
+
+def named(pictures):
+    for picture in pictures:
+        cv2.putText(picture, "DOE, JANE 12:33", (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, 255, 1)
+        picture[::20, -6:-1] = 255
+    return pictures
+
+
+def framed(pictures):
+    pictures[:, [0, -1]] = pictures[:, :, [0, -1]] = 200
+    return pictures
+
+
+def not_quite_black(pictures):
+    return pictures + np.random.default_rng(5).integers(0, 4, pictures.shape)
+
+
+def on_grey(pictures):
+    return np.maximum(pictures, 12)
+
+
+def compressed(pictures):
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85]
+    coded = [cv2.imencode(".jpg", one, quality)[1] for one in pictures]
+    return np.stack([cv2.imdecode(one, cv2.IMREAD_GRAYSCALE) for one in coded])
+
+
+def grabbed(pictures):
+    return compressed(framed(named(pictures)))
+
+
+@pytest.mark.parametrize("shown", [named, framed, not_quite_black, on_grey, compressed, grabbed])
+def test_what_a_screen_shows_around_the_sector_is_none_of_it(shown):
+    sector = fan()
+    found = shown_sector(np.asarray(shown(echoes(sector)), np.float32))
+    # A rim of two pixels: the hull's, and what the blocks of a compressed picture let ring.
+    rim = cv2.dilate(sector.astype(np.uint8), None, iterations=2).sum() - sector.sum()
+    assert (found != sector).sum() <= rim
+
+
+def test_a_sector_alone_is_found_to_the_pixel_and_a_full_picture_is_full():
+    sector = fan()
+    assert (shown_sector(echoes(sector).astype(np.float32)) == sector).mean() > 0.999
+    assert shown_sector(echoes(np.ones((60, 300), bool)).astype(np.float32)).all()
+
+
+def test_a_single_picture_and_one_that_stands_still_have_a_sector_too():
+    sector = fan()
+    still = np.maximum(echoes(sector, frames=1), sector).astype(np.float32)
+    assert dice(shown_sector(still), sector) > 0.99
+    assert (shown_sector(np.repeat(still, 5, axis=0)) == shown_sector(still)).all()

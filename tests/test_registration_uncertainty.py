@@ -205,6 +205,7 @@ class TestVerdict:
             ({"valid": 20}, "20 of 48"),
             ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
             ({"size": Size(-0.08, 0.1)}, "agree 10% better with a heart 8% smaller than"),
+            ({"apart": 0.07}, "parts of the recording agree 7% better with poses of their own"),
         ],
     )
     def test_each_weakness_makes_it_doubtful_and_is_named(self, change, reason):
@@ -247,14 +248,17 @@ class TestVerdict:
         bears_out = np.concatenate([np.arange(20) < count for count in borne_out] + [np.zeros(4)])
         assert outvoted(sweep, bears_out.astype(bool), least=10) == named
 
-    def test_sweeps_of_a_registration_are_compared(self):
+    def test_sweeps_of_a_registration_are_compared(self, monkeypatch):
+        monkeypatch.setattr(space, "gain_apart", lambda *_: 0.0)
         borne_out = np.arange(40) < 20
         none = np.zeros(0, np.float32)
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS}
         in_view = np.ones(40)
-        level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
+        level = SimpleNamespace(
+            samples=samples, at=lambda _: SimpleNamespace(in_view=in_view), only=lambda _: None
+        )
         found = SimpleNamespace(everything=level, bears_out=borne_out, pose=None, **sure)
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)

@@ -1,4 +1,4 @@
-/* Ask a baked field for the force at a point, as `beatfield query` does.
+/* Ask a baked field for the force at a point, as `beatfield query` does, outside the grid too.
  *
  *     cc -O2 -I "$(python -c 'from pipeline.field import get_include; print(get_include())')" \
  *        docs/examples/query.c -o query -lm
@@ -32,6 +32,10 @@ int main(int count, char **words)
     }
     for (n = 0; n < 3; n++) point_mm[n] = number(words[2 + n]);
     phase = number(words[5]);
+    if (!(fabs(phase) < 10)) {
+        fprintf(stderr, "error: phase %s is no share of the heartbeat, 0 to 1\n", words[5]);
+        return 2;
+    }
     for (n = 0; n < field.fixtures && status == BF_OK; n++) {
         const bf_fixture_part *law = &field.fixture[n];
         status = bf_distance(&field, law->structure, point_mm, phase, &distance_mm, NULL);

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.sparse import csr_array
 from scipy.stats import rankdata
 
 from pipeline.errors import InputError, UnregistrableError
 from pipeline.geometry import Float, Float32, Integer, Mask
 from pipeline.registration.contact import Contact
+from pipeline.registration.sector import shown_sector
 
 
 class TrackedSweep(Protocol):
@@ -296,17 +296,22 @@ def pixel_size_mm(sweep: TrackedSweep) -> Float:
 
 
 def sector_of(sweep: TrackedSweep) -> Mask:
-    """Where the sweep ever shows anything, ``(h, w)``; dark blood inside counts as shown."""
+    """Where the sweep shows echoes, ``(h, w)``; dark blood inside counts as shown.
+
+    Raises
+    ------
+    UnregistrableError
+        When that is hardly anywhere.
+    """
     if isinstance(sweep, BloodSweep):
         return sweep.sector
-    shown = np.isfinite(sweep.images).all(axis=0) & (sweep.images.max(axis=0) > 0)
-    sector = binary_fill_holes(binary_closing(shown, iterations=3) | shown)
-    if sector is None or sector.mean() < 0.02:
+    sector = shown_sector(sweep.images)
+    if sector.mean() < 0.02:
         raise UnregistrableError(
-            f"{sweep.name}: only {shown.mean():.1%} of the pixels ever show anything; "
+            f"{sweep.name}: only {sector.mean():.1%} of the pixels ever show anything; "
             "needs grey values with a sector in view"
         )
-    return np.asarray(sector, dtype=bool)
+    return sector
 
 
 def _lattice(sector: Mask, pixel_mm: Float, spacing_mm: float) -> Integer:

@@ -24,6 +24,7 @@ from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep, backwards, mirrored
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
+from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.reading import as_compared
 from pipeline.registration.search import Level, Search, prepare_search
@@ -404,5 +405,6 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
+        apart=gain_apart(level.only(np.flatnonzero(shows)), found.pose, search.pivot, sweep[shows]),
     )
     return judge(evidence, settings)

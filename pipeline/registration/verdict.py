@@ -20,6 +20,9 @@ _AGAINST, _FOR = 0.25, 0.5
 # So many frames in a row that show the heart and do not fit are no chance.
 _IN_A_ROW = 10
 
+# By what share of the score parts of a recording may agree better with poses of their own.
+_APART = 0.06
+
 # Share of the best score that another pose may reach before the answer is in doubt, or open.
 _DOUBTFUL_RIVAL, _EQUAL_RIVAL = 0.75, 0.9
 
@@ -58,6 +61,9 @@ class Evidence:
     astray: tuple[int, int] = (0, 0)
     """The most frames of a sweep in a row that show the heart and do not bear the pose out, and the
     sweep's number, counted from 1."""
+
+    apart: float = 0.0
+    """By what share of the score parts of the recording agree better with poses of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +192,12 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
             f"{in_a_row} frames in a row of sweep {number} show the heart and do not bear out what "
             "the others do: was the patient, the tracker or the reference moved meanwhile, or the "
             "depth changed? Cut them off, or record the sweep again"
+        )
+    if evidence.apart > _APART:
+        reasons.append(
+            f"parts of the recording agree {evidence.apart:.0%} better with poses of their own: "
+            "was the patient, the tracker or the reference moved meanwhile, or is the calibration "
+            "or the pixel size off?"
         )
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")

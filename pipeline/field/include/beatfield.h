@@ -196,8 +196,8 @@ typedef struct {
     int started, blind, driving;    /* driving: the force went with the motion when the tool last moved */
 } bf_tank;
 
-/* A tank that holds level_mj to begin with, and capacity_mj at most; what is no number, or less than
- * nothing, is 0. */
+/* A tank that holds level_mj to begin with, and capacity_mj at most; what is no finite number, or
+ * less than nothing, is 0: such a tank lets nothing pass that drives. */
 bf_tank bf_full_tank(double level_mj, double capacity_mj);
 
 /* What may be rendered of a force, in place, at the tool's present point. Where one of them is not
@@ -2050,7 +2050,7 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
     bf_tank tank;
     memset(&tank, 0, sizeof tank);
     tank.capacity_mj = capacity_mj > 0 && bf__numeric(capacity_mj) ? capacity_mj : 0;
-    tank.level_mj = level_mj > 0 ? level_mj : 0;
+    tank.level_mj = level_mj > 0 && bf__numeric(level_mj) ? level_mj : 0;
     if (tank.level_mj > tank.capacity_mj) tank.level_mj = tank.capacity_mj;
     return tank;
 }
