@@ -2,7 +2,8 @@
 
     python benchmarks/registration_figures.py OUT [--hearts 20] [--seed 3001] [--starts 1]
         [--probes combined,intracardiac,epicardial] [--surfaces truth|PRODUCTS] [--phases 20]
-        [--peer 20] [--global 0] [--calibration-error MM DEG] [--mr-pixels 1] [--reading grey]
+        [--peer 20] [--global 0] [--calibration-error MM DEG] [--moved 0] [--mr-pixels 1]
+        [--reading grey]
         [--frames 48,24,40,12,48,32,16]
 
 Each heart is examined with each probe, every time with another number of frames, share of frames
@@ -13,8 +14,9 @@ in the cine, and to the cine itself, rather than to the phantom's own meshes at 
 of the beat. ``--peer N`` runs SimpleITK's mutual information beside it on the first N studies,
 ``--global N`` registers the first N without any start. ``--calibration-error MM DEG`` puts the
 pictures of each sweep so far beside their place, and registers with ``calibration: per_sweep`` too
-(0 0: right). ``--frames`` are the frames of the studies, in turn. ``--mr-pixels 1.05`` tells larger
-pixels of the cine. What OUT/results.jsonl holds, line by line, is not done again.
+(0 0: right). ``--moved 4`` moves the patient by so many millimetres between the two sweeps.
+``--frames`` are the frames of the studies, in turn. ``--mr-pixels 1.05`` tells larger pixels of the
+cine. What OUT/results.jsonl holds, line by line, is not done again.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from registration_studies import (
     found_surfaces,
     make_study,
     miscalibrated,
+    moved_between,
     require_same,
     start_of,
     true_surfaces,
@@ -135,6 +138,7 @@ def registered(
         "rival": found.rival,
         "larger": found.size.larger,
         "better_by_size": found.size.gain,
+        "apart": found.apart,
         "valid": float(found.valid.sum() / max((found.residual < 1).sum(), 1)),
         "verdict": found.verdict,
         "reason": found.reason,
@@ -169,7 +173,7 @@ def work(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Do what has not been done yet; all results."""
     path = arguments.out / "results.jsonl"
     arguments.out.mkdir(parents=True, exist_ok=True)
-    decisive = ("surfaces", "phases", "calibration_error", "mr_pixels", "reading")
+    decisive = ("surfaces", "phases", "calibration_error", "moved", "mr_pixels", "reading")
     require_same(arguments.out, {name: getattr(arguments, name) for name in decisive})
     results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {(one["study"], one["method"], one["start"]) for one in results}
@@ -203,6 +207,8 @@ def result_of(
     study = make_study(order, arguments.out / "studies")
     if arguments.calibration_error is not None:
         study = miscalibrated(study, order.seed, *arguments.calibration_error)
+    if arguments.moved:
+        study = moved_between(study, order.seed, arguments.moved)
     share = SHARES[start % len(SHARES)]
     guess = start_of(study, 100 * order.seed + start, 20 * share, 20 * share)
     if method == "peer":
@@ -241,6 +247,7 @@ def main() -> None:
     parser.add_argument("--peer", type=int, default=20)
     parser.add_argument("--frames", default=FRAMES, help="of the studies, in turn")
     parser.add_argument("--calibration-error", nargs=2, type=float, metavar=("MM", "DEG"))
+    parser.add_argument("--moved", type=float, default=0.0, metavar="MM")
     parser.add_argument("--mr-pixels", type=float, default=1.0, metavar="FACTOR")
     parser.add_argument("--reading", choices=["network", "grey"], default="network")
     parser.add_argument("--global", dest="without_start", type=int, default=0)

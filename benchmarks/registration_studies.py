@@ -226,6 +226,18 @@ def miscalibrated(study: Study, seed: int, shift_mm: float, turn_deg: float) -> 
     return replace(study, sweeps=sweeps)
 
 
+def moved_between(study: Study, seed: int, shift_mm: float) -> Study:
+    """The study of a patient who moved by so much, in a random direction, between the sweeps; the
+    truth is that of half-way."""
+    way = np.random.default_rng([seed, 13]).standard_normal(3)
+    sweeps = []
+    for sweep, share in zip(study.sweeps, np.linspace(-0.5, 0.5, len(study.sweeps)), strict=True):
+        move = np.eye(4)
+        move[:3, 3] = share * shift_mm * way / np.linalg.norm(way)
+        sweeps.append(replace(sweep, tracker_from_image=move @ sweep.tracker_from_image))
+    return replace(study, sweeps=sweeps)
+
+
 def start_of(study: Study, seed: int, shift_mm: float, turn_deg: float) -> Float:
     """A first guess this far off: turned about the heart's middle, and shifted."""
     rng = np.random.default_rng([seed, 7])

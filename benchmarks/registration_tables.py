@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import Size
-from pipeline.registration.verdict import Evidence, judge
+from pipeline.registration.verdict import APART, Evidence, judge
 
 CAPTURED_MM = 2.0
 
@@ -89,7 +89,13 @@ def calibration(results: list[dict[str, Any]]) -> list[str]:
         rms = np.sqrt((means**2).mean())
         under = f"{(means < CAPTURED_MM).mean():.1%}"
         text.append(f"| {verdict} | {len(some)} | {under} | {expected:.2f} | {rms:.2f} |")
-    parts = (chances(results), thresholds(results), coverage(results), sizes(results))
+    parts = (
+        chances(results),
+        thresholds(results),
+        coverage(results),
+        sizes(results),
+        aparts(results),
+    )
     for part in parts:
         text += ["", *part]
     return text
@@ -103,6 +109,16 @@ def sizes(results: list[dict[str, Any]]) -> list[str]:
     told = sum(Size(0.0, gain).in_doubt for gain in gains)
     best = ", ".join(f"{gain:.1%}" for gain in np.sort(gains)[::-1][:3])
     return [f"Size in doubt: {told} of {len(gains)}; the largest gains are {best}."]
+
+
+def aparts(results: list[dict[str, Any]]) -> list[str]:
+    """How many results have parts that agree clearly better with poses of their own."""
+    gains = np.sort([one["apart"] for one in results if "apart" in one])
+    if not len(gains):
+        return []
+    told = int((gains > APART).sum())
+    ends = f"{gains[0]:.1%} to {gains[-1]:.1%}, median {np.median(gains):.1%}"
+    return [f"Parts apart: {told} of {len(gains)}; gains are {ends}."]
 
 
 def chances(results: list[dict[str, Any]]) -> list[str]:
@@ -129,8 +145,9 @@ def graded(one: dict[str, Any], good_tre_mm: float | None = None) -> str:
     sure = one["confidence"], one["rival"], one["expected_mm"]
     valid = round(one["valid"] * one["frames"])
     size = Size(one.get("larger", 0.0), one.get("better_by_size", 0.0))
+    told = {"size": size, "apart": one.get("apart", 0.0)}
     return judge(
-        Evidence(*sure, valid, one["frames"], shift_mm=0.0, turn_deg=0.0, size=size),
+        Evidence(*sure, valid, one["frames"], shift_mm=0.0, turn_deg=0.0, **told),
         settings.model_copy(update=limit_mm),
     ).grade
 

@@ -248,17 +248,14 @@ class TestVerdict:
         bears_out = np.concatenate([np.arange(20) < count for count in borne_out] + [np.zeros(4)])
         assert outvoted(sweep, bears_out.astype(bool), least=10) == named
 
-    def test_sweeps_of_a_registration_are_compared(self, monkeypatch):
-        monkeypatch.setattr(space, "gain_apart", lambda *_: 0.0)
+    def test_sweeps_of_a_registration_are_compared(self):
         borne_out = np.arange(40) < 20
         none = np.zeros(0, np.float32)
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
-        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS}
+        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": 0.0}
         in_view = np.ones(40)
-        level = SimpleNamespace(
-            samples=samples, at=lambda _: SimpleNamespace(in_view=in_view), only=lambda _: None
-        )
+        level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
         found = SimpleNamespace(everything=level, bears_out=borne_out, pose=None, **sure)
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)

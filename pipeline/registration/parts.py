@@ -19,7 +19,8 @@ from pipeline.geometry import Float, Integer
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.search import Level
 
-# So many parts or more, of one sweep each, and of no fewer frames than have six parameters to fit.
+# So many parts where there are frames enough: each of one sweep, and of no fewer frames than have
+# six parameters to fit.
 _PARTS, _LEAST_FRAMES = 4, 6
 # Of the mean curvature: what holds a part where its frames do not.
 _DAMPING = 0.01
@@ -48,13 +49,13 @@ def gain_apart(level: Level, pose: Float, pivot: Pivot, sweep: Integer) -> float
 
 
 def parts_of(sweep: Integer) -> Iterator[Integer]:
-    """Places of the frames of each part: sweeps, each cut evenly in time until there are enough."""
+    """Places of the frames of each part: sweeps, each cut evenly in time as far as frames reach."""
     numbers = np.unique(sweep)
-    pieces = -(-_PARTS // max(len(numbers), 1))
+    wanted = -(-_PARTS // max(len(numbers), 1))
     for number in numbers:
-        for part in np.array_split(np.flatnonzero(sweep == number), pieces):
-            if len(part) >= _LEAST_FRAMES:
-                yield part
+        own = np.flatnonzero(sweep == number)
+        pieces = min(wanted, len(own) // _LEAST_FRAMES)
+        yield from np.array_split(own, pieces) if pieces else ()
 
 
 def _gain(level: Level, pose: Float, pivot: Pivot) -> float:

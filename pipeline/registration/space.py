@@ -114,6 +114,9 @@ class Registration:
     """Of the heart that the frames fit best; where that puts it in doubt, the covariance holds what
     it is off."""
 
+    apart: float
+    """By what share of the score parts of the recording agree better with poses of their own."""
+
     clock: ClockOffset | None
     """How far the clock of the frames is ahead of the ECG's; None where it was not asked for."""
 
@@ -138,6 +141,7 @@ class _Found:
     """Of the frames of ``everything``, as those of ``breath_mm``."""
 
     size: Size
+    apart: float
 
 
 def register(
@@ -238,8 +242,9 @@ def find(
     bears_out = _bears_out(everything, pose, search.pivot)
     judged = _judged(everything, bears_out, settings)
     size = fitting_size(judged, pose, search.pivot, planes_of(cine))
+    apart = _apart(everything, pose, search.pivot, sizes)
     sure = confidence, rival, settled.clock
-    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out, size)
+    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out, size, apart)
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -383,8 +388,15 @@ def _summarise(
         verdict=verdict.grade,
         reason=verdict.reason,
         size=found.size,
+        apart=found.apart,
         clock=found.clock,
     )
+
+
+def _apart(level: Level, pose: Float, pivot: Pivot, sizes: Sequence[int]) -> float:
+    """What parts of the recording, of frames that show the heart, gain by poses of their own."""
+    shows = level.only(np.flatnonzero(level.at(pose).in_view > LEAST_IN_VIEW))
+    return gain_apart(shows, pose, pivot, shows.samples.sweep(sizes))
 
 
 def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
@@ -405,6 +417,6 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
-        apart=gain_apart(level.only(np.flatnonzero(shows)), found.pose, search.pivot, sweep[shows]),
+        apart=found.apart,
     )
     return judge(evidence, settings)
