@@ -11,7 +11,8 @@ READY := $(VENV)/ready
 SEED ?= 1
 DEMO := demo/studies-$(SEED)/patient-0001
 STUDY ?= $(DEMO)
-OUT ?= demo/products-$(SEED)
+DEMO_OUT := demo/products-$(SEED)
+OUT ?= $(DEMO_OUT)
 STUDIES ?= demo/studies-$(SEED)
 CONFIG ?= configs/default.yaml
 WORKERS ?= 2
@@ -23,6 +24,8 @@ DEMO_STUDY := $(if $(filter-out $(DEMO),$(STUDY)),$(READY),$(DEMO)/study.yaml)
 
 STAGES := ingest segment surface register bake evaluate report
 
+# Stages of one study follow each other, and demo studies are made once.
+.NOTPARALLEL:
 .PHONY: help setup demo paper test check lint types bench train batch clean $(STAGES)
 
 help: ## explain every target
@@ -47,8 +50,8 @@ $(DEMO)/study.yaml: $(READY)
 	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite
 
 paper: $(READY) ## the paper's figures and table, re-run from the demo's field: paper/index.html
-	test -d "$$OUT/patient-0001/bake/field.zarr" || $(MAKE) demo
-	$(BIN)/beatfield paper paper --products "$$OUT/patient-0001" --study "$$STUDY"
+	test -d $(DEMO_OUT)/patient-0001/bake/field.zarr || $(MAKE) demo STUDY=$(DEMO) OUT=$(DEMO_OUT)
+	$(BIN)/beatfield paper paper --products $(DEMO_OUT)/patient-0001 --study $(DEMO)
 
 test: setup ## run all tests
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
@@ -93,7 +96,7 @@ train: setup ## make both networks' weights anew from the phantom (needs PyTorch
 	$(BIN)/python -m data_synth.training.ultrasound --out training/ultrasound --workers $(WORKERS)
 	cp training/ultrasound/blood.onnx pipeline/registration/weights/blood.onnx
 
-$(STAGES): setup
+$(STAGES): $(DEMO_STUDY)
 	$(BIN)/beatfield $@ "$$STUDY" --out "$$OUT" --config "$$CONFIG"
 
 batch: setup ## run a folder of studies: make batch STUDIES=... OUT=... WORKERS=2

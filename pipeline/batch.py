@@ -25,11 +25,20 @@ from pipeline.batch_plan import (
     plan_batch,
     products_of,
 )
-from pipeline.batch_table import INTERRUPTED, NO_STUDY, Ended, Outcome, outcome_of, rows
+from pipeline.batch_table import (
+    INTERRUPTED,
+    NO_STUDY,
+    WAITING,
+    Ended,
+    Outcome,
+    outcome_of,
+    rows,
+)
 from pipeline.batch_table import write_table as write_csv
 from pipeline.errors import NOT_TO_BE_USED, InputError
 from pipeline.publish import (
     PARTIAL,
+    STAGE_FILE,
     locked,
     read_record,
     readable_write_errors,
@@ -178,6 +187,7 @@ class _Running:
         self._options += ["--until", last] if last else []
         self._children = _Children()
         self._ended: list[Ended] = []
+        self._waiting: dict[str, Ended] = {}
 
     def run(self, workers: int) -> None:
         """Run all studies that can be, and tell of the others first."""
@@ -188,6 +198,9 @@ class _Running:
             elif plan.refused:
                 self._tell(self._not_done(plan, "failed", plan.refused))
         able = [plan for plan in self._plans if plan.is_study and not plan.refused]
+        # A batch that is killed must not leave the table of another, nor one that looks whole.
+        self._waiting = {plan.name: self._not_begun(plan, WAITING) for plan in able}
+        self._write()
         with (
             _passing_signals_on(self._children, self._watcher),
             ThreadPoolExecutor(workers) as pool,
@@ -212,11 +225,15 @@ class _Running:
 
     def _tell(self, one: Ended) -> None:
         self._ended.append(one)
-        # What cannot be written now may be later; only the last time counts.
-        write_csv(self._out / TABLE, rows(self._ended))
+        self._waiting.pop(one.outcome.patient, None)
+        self._write()
         total = sum(plan.is_study for plan in self._plans)
         done = sum(other.outcome.status != NO_STUDY for other in self._ended)
         self._watcher.ended(one.outcome, done, total)
+
+    def _write(self) -> None:
+        # What cannot be written now may be later; only the last time counts.
+        write_csv(self._out / TABLE, rows([*self._ended, *self._waiting.values()]))
 
     def _run_one(self, plan: Plan) -> Ended:
         try:
@@ -228,7 +245,7 @@ class _Running:
 
     def _call(self, plan: Plan) -> Ended:
         if self._children.stopped:
-            return self._not_done(plan, INTERRUPTED, "not begun")
+            return self._not_begun(plan)
         command = [sys.executable, "-m", "pipeline.batch_member", "run", str(plan.folder)]
         command += self._options
         log = self._out / LOGS / _log_name(plan.name)
@@ -239,7 +256,7 @@ class _Running:
         with handle:
             code = self._children.call(command, handle)
         if code is None:
-            return self._not_done(plan, INTERRUPTED, "not begun")
+            return self._not_begun(plan)
         seconds = time.perf_counter() - clock
         status, cause = how_it_ended(code, log, self._children.stopped)
         if status != "done":
@@ -250,8 +267,19 @@ class _Running:
             lost = products or self._out / (plan.patient_id or plan.name)
             cause = f"{lost}/run.json: cannot be read though the run ended well; run it again"
             return self._not_done(plan, "failed", cause, seconds, before)
-        ended = plan.name, status, cause, plan.patient_id, plan.folder
+        # After --until, what lies behind may be of other settings.
+        ended = plan.name, status, old_products(products, True), plan.patient_id, plan.folder
         return outcome_of(*ended, seconds, record, products)
+
+    def _not_begun(self, plan: Plan, status: str = INTERRUPTED) -> Ended:
+        """A study that nothing has been done about; its products may well hold."""
+        products, cause = products_of(self._out, plan), "not begun"
+        if products and any(products.glob(f"*/{STAGE_FILE}")):
+            cause += f"; {products} holds products of an earlier run, if of other settings or input"
+        shown = (
+            products if read_record(products).get("study") == str(plan.folder.resolve()) else None
+        )
+        return outcome_of(plan.name, status, cause, plan.patient_id, plan.folder, products=shown)
 
     def _not_done(
         self,

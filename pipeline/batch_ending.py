@@ -11,6 +11,8 @@ from pipeline.errors import INTERRUPTED_CODE, NOT_TO_BE_USED
 from pipeline.publish import STAGE_FILE, read_record
 
 TOLD_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_LIBRARIES_SAY = ("Task exception", "Traceback", "Exception ignored")
+"""How what a library or Python itself tells of an error begins."""
 OUT_OF_MEMORY = (signal.SIGKILL, signal.SIGABRT)
 """How the system ends a program that asks for too much memory, and how libraries end theirs."""
 
@@ -26,7 +28,7 @@ def how_it_ended(code: int, log: Path, told_to_end: bool) -> tuple[str, str]:
     # Libraries may take an interrupt for an error of their own.
     if told_to_end or code == INTERRUPTED_CODE or -code in TOLD_TO_END:
         return INTERRUPTED, "; ".join(["what was finished is kept", *notes])
-    last = lines[-1] if lines else "no message"
+    last = lines[-1] if lines else "no message (its log is empty: is the disk full?)"
     why = _signal_name(-code) if code < 0 else last
     if -code in OUT_OF_MEMORY or "MemoryError" in last or "bad_alloc" in last:
         why += "; memory may be short: use fewer --workers"
@@ -42,7 +44,7 @@ def _said(lines: Sequence[str]) -> tuple[str, list[str]]:
         if line.startswith(("error: ", "note: ")):
             parts.append([line.partition(": ")[2]])
             ended = False
-        elif not line.strip():
+        elif not line.strip() or line.startswith(_LIBRARIES_SAY):
             ended = True
         elif not ended:
             parts[-1].append(line.strip())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.publish import read_record
-from pipeline.study import how_to_name_cine, open_study, studies_in
+from pipeline.study import how_to_name_cine, is_study, open_study, studies_in
 from pipeline.study_files import cannot_be_entered, is_litter
 
 TABLE, LOGS = "batch.csv", "logs"
@@ -49,7 +49,8 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
         raise InputError(f"{studies}: no such folder; give the folder that holds the studies")
     try:
         direct = set(studies_in(studies))
-        folders = sorted(path for path in studies.iterdir() if path.is_dir())
+        beside = sorted(studies.iterdir())
+        folders = [path for path in beside if path.is_dir() or _is_dead(path)]
     except OSError as error:
         raise InputError(cannot_be_entered(error)) from error
     here = out.resolve()
@@ -60,8 +61,14 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
     ]
     plans = [_plan(one, one in direct) for one in looked_at]
     plans = [one for one in plans if one.is_study or not here.is_relative_to(one.folder.resolve())]
-    if not any(one.is_study for one in plans):
-        first = plans[0].folder if plans else studies
+    there = [one for one in plans if not _is_dead(one.folder)]
+    if not any(one.is_study for one in there):
+        if is_study(studies):
+            raise InputError(
+                f"{studies}: is a study itself; give the folder that holds it, or run it alone: "
+                f"beatfield run {studies} --out {out}"
+            )
+        first = there[0].folder if there else studies
         raise InputError(
             f"{studies}: holds no study (folders with cine/ or study.yaml); for {first}: "
             f"{how_to_name_cine(first)}"
@@ -70,7 +77,15 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
     return _without_clashes(plans)
 
 
+def _is_dead(path: Path) -> bool:
+    return path.is_symlink() and not path.exists()
+
+
 def _plan(path: Path, direct: bool) -> Plan:
+    if _is_dead(path):
+        to = path.readlink()
+        said = f"{path}: is a link to {to}, where nothing is; mount it, or take the link out"
+        return Plan(path.name, path, refused=said)
     try:
         inside = [path] if direct else studies_in(path)
     except OSError as error:
@@ -131,13 +146,11 @@ def notes_on(studies: Path, out: Path, plans: Sequence[Plan]) -> list[str]:
         # Gone while the studies ran; what they left is told all the same.
         beside = []
     loose = [one.name for one in beside if not one.is_symlink() and not is_litter(one.name)]
-    dead = [one.name for one in beside if one.is_symlink() and not one.exists()]
     known = {one.patient_id or one.name for one in plans if one.is_study}
     known |= {products.name for one in plans if (products := products_of(out, one))}
     others = [one.name for one in _patients(out) if one.name not in known]
     told = (
         (loose, f"{studies}: files beside the studies were not looked at"),
-        (dead, f"{studies}: links lead nowhere"),
         (others, f"{out}: also holds products that are of no study of this batch"),
     )
     return [f"{what}: {_named(names)}" for names, what in told if names]

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.console import in_one_line
 from pipeline.errors import InputError
 from pipeline.publish import write_whole
 from pipeline.summary import remarks
@@ -20,6 +21,10 @@ INTERRUPTED = "interrupted"
 """Status of a study that was told to end, or that was not begun."""
 
 
+WAITING = "not ended"
+"""Status of a study of a batch that is at work, or was killed."""
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """How one patient's run ended."""
@@ -28,7 +33,8 @@ class Outcome:
     """Name of the folder among the studies."""
 
     status: str
-    """done, failed (the program said why), crashed (it could not), `INTERRUPTED` or `NO_STUDY`."""
+    """done, failed (the program said why), crashed (it could not), `INTERRUPTED`, `NO_STUDY` or
+    `WAITING`."""
 
     seconds: float
     lv_ejection_fraction: float | None
@@ -184,6 +190,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
             f"{' '.join(figures)}  {one.registration or '-':8s}  {one.cause or one.remarks}"
         )
     # Names of folders may hold bytes that are no text.
+    # A name of several lines would forge a row.
+    lines = [in_one_line(line) for line in lines]
     return "\n".join(lines).encode("utf-8", "backslashreplace").decode()
 
 

@@ -61,7 +61,7 @@ class BatchConsole:
         to_go_min = (time.monotonic() - self._began_s) / done * (total - done) / 60
         rest = f", about {to_go_min:.0f} min to go" if to_go_min >= 1 else ""
         took = f"{outcome.status} in {outcome.seconds:.1f} s"
-        say(f"{done}/{total} {outcome.patient:24s} {took}{rest}")
+        say(f"{done}/{total} {in_one_line(outcome.patient):24s} {took}{rest}")
 
     def interrupted(self, running: int) -> None:
         """No other study begins."""
@@ -103,6 +103,11 @@ def plain(text: str) -> str:
     a\\x1b[2Jb
     """
     return _COMMANDS.sub(lambda one: ascii(one[0])[1:-1], text)
+
+
+def in_one_line(name: str) -> str:
+    """A folder's name, which may hold the ends of lines."""
+    return name.replace("\n", "\\n")
 
 
 def warning_line(message: Warning | str, *_: object, **__: object) -> str:

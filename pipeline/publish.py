@@ -75,8 +75,9 @@ def publishing(target: Path) -> Iterator[Path]:
                 remove_partials(target.parent, target.name)
             remove(partial)
             partial.mkdir()
-            yield partial
-            _swap(partial, target)
+            with _held(partial):
+                yield partial
+                _swap(partial, target)
         finally:
             remove(partial)
 
@@ -117,15 +118,56 @@ def readable_write_errors(target: Path) -> Iterator[None]:
 def _swap(partial: Path, target: Path) -> None:
     """Put ``partial`` in the place of ``target``; a folder cannot be renamed over another."""
     old = target.with_name(f".{target.name}{PARTIAL}old-{os.getpid()}")
-    try:
-        if target.exists():
-            target.rename(old)
-        partial.rename(target)
-    except BaseException:
-        if old.exists() and not target.exists():
-            old.rename(target)
-        raise
+    # In a container every run may have this number, and one may have been killed right here.
     remove(old)
+    with _held(target):
+        try:
+            if target.exists():
+                target.rename(old)
+            partial.rename(target)
+        except BaseException:
+            if old.exists() and not target.exists():
+                old.rename(target)
+            raise
+        remove(old)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Show others that a process is at work in a folder, under whatever name; see `_in_use`."""
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        # There is none, or it is a file.
+        yield
+        return
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _in_use(path: Path) -> bool:
+    """Whether a living process holds a partial: process numbers alone tell none apart that are
+    counted anew, as in containers or after a restart."""
+    pid = path.name.rpartition("-")[2]
+    known = pid.isdecimal() and _lives(int(pid))
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return known and int(pid) != os.getpid()
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        # A file system without locks of folders.
+        return known
+    finally:
+        os.close(handle)
+    return False
 
 
 def remove(path: Path) -> None:
@@ -149,8 +191,7 @@ def _lives(pid: int) -> bool:
 def remove_partials(folder: Path, name: str = "*") -> None:
     """Clear away what killed runs left unfinished, of one product or of all."""
     for path in folder.glob(f".{name if name == '*' else escape(name)}{PARTIAL}*"):
-        pid = path.name.rpartition("-")[2]
-        if not (pid.isdecimal() and _lives(int(pid))):
+        if not _in_use(path):
             remove(path)
 
 
@@ -273,7 +314,8 @@ def require_unaltered(folder: Path) -> None:
         if sha256_of(folder / name) != entry["sha256"]:
             raise InputError(
                 f"{folder / name}: is not what the stage {folder.name} wrote: it was edited, or "
-                f"damaged on the disk; run that stage again (--from {folder.name})"
+                "damaged on the disk; to make it anew: beatfield run STUDY --out "
+                f"{folder.parent.parent} --from {folder.name}"
             )
 
 

@@ -154,6 +154,7 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     target = run.products / stage.name
     standing = sealed(target)
     if standing and standing["fingerprint"] == key and not force:
+        _require_as_it_was(run, stage, target)
         run.watcher.ended(stage.name, "unchanged", 0.0)
         run.stages[stage.name] = _entry(run, stage.name, "done", standing["figures"], key)
         return
@@ -185,6 +186,17 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
     run.watcher.ended(stage.name, "done", seconds)
 
 
+def _require_as_it_was(run: _Run, stage: Stage, target: Path) -> None:
+    """Let no product stand whose bytes are others than were sealed. It is not made anew unasked:
+    labels may have been corrected by hand."""
+    clock = time.perf_counter()
+    try:
+        require_unaltered(target)
+    except InputError as error:
+        _fail(run, stage, error, time.perf_counter() - clock)
+        raise
+
+
 def _is_settled(run: _Run, stage: Stage) -> bool:
     """Whether an earlier run made of the same what there is to make, if only a reason for none."""
     key, standing = _fingerprint(run, stage), sealed(run.products / stage.name)
@@ -209,11 +221,13 @@ def _require_ultrasound(run: _Run, register: Stage, force: bool) -> None:
 
 def _fail(run: _Run, stage: Stage, error: Exception, seconds: float) -> None:
     """Record that a stage failed, and say what of earlier runs is no longer to be used."""
+    standing = _all_stages(run)
+    later = [one.name for one in STAGES[STAGES.index(stage) :]]
+    left = [name for name in later if (run.products / name).is_dir()]
     run.stages[stage.name] = {"status": "failed", "cause": str(error)}
     run.watcher.ended(stage.name, "failed", seconds)
     _record(run, "failed")
-    later = STAGES[STAGES.index(stage) :]
-    _warn_of(run, [one.name for one in later if (run.products / one.name).is_dir()], error)
+    _warn_of(run, [name for name in left if standing.get(name, {}).get("status") != "done"], error)
 
 
 def _warn_of(run: _Run, old: list[str], error: BaseException) -> None:

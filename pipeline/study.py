@@ -139,18 +139,21 @@ def open_study(folder: Path) -> Study:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such study; give the folder that holds cine/ or study.yaml")
-    if not _is_study(folder):
+    if not is_study(folder):
         inside = studies_in(folder)
         if len(inside) != 1:
             raise InputError(_no_study_message(folder, inside))
         folder = inside[0]
-    folder = folder.resolve()
+    # A link has a name of its own, and many may lead to folders of one name.
+    called, folder = folder.name if folder.is_symlink() else "", folder.resolve()
     _require_name_of_description(folder)
     described = folder / "study.yaml"
     require_no_device(described)
     given = _read_yaml(described) if described.exists() else {}
     try:
-        study = _understood(folder, given, str(described if given else folder))
+        study = _understood(
+            folder, called or folder.name, given, str(described if given else folder)
+        )
         _require_files(study)
     except (ValueError, OSError) as error:
         if isinstance(error, OSError) and error.errno != errno.ENAMETOOLONG:
@@ -167,10 +170,11 @@ def studies_in(folder: Path) -> list[Path]:
     Hidden ones are not: in them programs write what is not yet whole.
     """
     seen = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in seen if path.is_dir() and _is_study(path))
+    return sorted(path for path in seen if path.is_dir() and is_study(path))
 
 
-def _is_study(folder: Path) -> bool:
+def is_study(folder: Path) -> bool:
+    """Whether a folder holds a study itself, not in a folder below."""
     return (folder / "study.yaml").is_file() or (folder / "cine").is_dir()
 
 
@@ -212,14 +216,14 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
-def _understood(folder: Path, given: dict[str, Any], where: str) -> Study:
+def _understood(folder: Path, called: str, given: dict[str, Any], where: str) -> Study:
     """What the folders hold, each key that is given in its place."""
-    if "patient_id" not in given and not re.fullmatch(PATIENT_ID, folder.name):
+    if "patient_id" not in given and not re.fullmatch(PATIENT_ID, called):
         raise InputError(
             f"{folder}: its name is no patient id, which has letters, digits and '_ . -' alone, a "
             "letter or digit first; rename the folder, or give patient_id in study.yaml"
         )
-    content = {"patient_id": folder.name, **given}
+    content = {"patient_id": called, **given}
     for name, found in (("ecg", found_ecg(folder)), ("us", found_us(folder))):
         content[name] = _overridden(found, given[name]) if name in given else found
     if content["ecg"] is None:
@@ -282,7 +286,10 @@ def _require_files(study: Study) -> None:
     _require_what_fits_the_cine(study)
     for stem in (study.ecg.mr, study.ecg.us):
         if stem is not None and not record_files(stem):
-            raise InputError(f"{study.folder}: no ECG record {stem}; study.yaml names it")
+            raise InputError(
+                f"{study.folder}: no ECG record {stem}, which study.yaml names; add its .hea and "
+                "data, .csv or .dcm, name the right one, or write null there"
+            )
         for header in record_files(stem):
             if stem and header.suffix == ".hea" and header.stem == stem.stem:
                 require_signals(header)

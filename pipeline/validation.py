@@ -75,7 +75,7 @@ def describe_validation(
             known = one["ctx"].get("expected_tags", "")
             message = f"needs `{kind}:`, one of {known}{given}" if known else f"needs `{kind}:`"
         elif one["type"] == "string_type" and not isinstance(one["input"], dict | list | None):
-            message = "needs text; put it in quotes"
+            message = "needs text; put it in quotes as it stands in the file"
         elif one["type"] == "string_pattern_mismatch":
             message = "needs letters, digits and '_ . -' alone, a letter or digit first"
         elif one["type"] in PLAIN:

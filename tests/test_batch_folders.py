@@ -36,7 +36,9 @@ products = out / one.patient_id
 products.mkdir(exist_ok=True)
 image = (one.cine.path / "image").read_text()
 inputs = {"cine": {"cine/image": image}} if image else {}
-record = {"study": str(one.folder), "stages": {}, "inputs": inputs}
+told = study / "stages"
+stages = json.loads(told.read_text()) if told.exists() else {}
+record = {"study": str(one.folder), "stages": stages, "inputs": inputs}
 (products / "run.json").write_text(json.dumps(record))
 if study.name == "vanishes":
     shutil.rmtree(study)
@@ -146,12 +148,60 @@ def test_what_belongs_to_no_study_is_told(
     (out / "last-year" / "run.json").write_text("{}")
     (studies / "list.txt").touch()
     (studies / ".hidden").touch()
-    (studies / "lost").symlink_to("nowhere")
     assert batch(studies) == 0
     notes = [one for one in capsys.readouterr().out.splitlines() if one.startswith("note ")]
     assert notes[0].endswith("files beside the studies were not looked at: list.txt")
-    assert notes[1].endswith("links lead nowhere: lost")
-    assert notes[2].endswith("holds products that are of no study of this batch: last-year")
+    assert notes[1].endswith("holds products that are of no study of this batch: last-year")
+
+
+def test_a_link_that_leads_nowhere_is_a_study_that_failed(studies: Path) -> None:
+    """As of an archive that is not mounted: whoever looks for its row must find one."""
+    (studies / "lost").symlink_to("/mnt/nowhere")
+    assert batch(studies) == 1
+    row = rows_of(studies.parent / "out")["lost"]
+    assert row["status"] == "failed"
+    assert row["cause"].startswith(f"{studies / 'lost'}: is a link to /mnt/nowhere, where nothing")
+
+
+def test_a_study_is_not_taken_for_a_folder_of_studies(studies: Path) -> None:
+    with pytest.raises(InputError, match=r"good: is a study itself; .*beatfield run .*good --out"):
+        plan_batch(studies / "good", studies.parent / "out")
+
+
+def test_links_give_their_own_names_to_studies_of_one_name(studies: Path) -> None:
+    for name in ("alice", "bob"):
+        make_study(studies.parent / "archive" / name / "study")
+        (studies / name).symlink_to(studies.parent / "archive" / name / "study")
+    assert batch(studies) == 0
+    rows = rows_of(studies.parent / "out")
+    assert {name: rows[name]["patient_id"] for name in ("alice", "bob")} == {
+        "alice": "alice",
+        "bob": "bob",
+    }
+
+
+def test_a_study_that_ended_early_tells_of_what_is_old_behind(studies: Path) -> None:
+    """--until leaves what an earlier run made of other settings where it is."""
+    stages = {"bake": {"status": "stale"}, "report": {"status": "stale"}}
+    (studies / "good" / "stages").write_text(json.dumps(stages))
+    bake = studies.parent / "out" / "good" / "bake"
+    bake.mkdir(parents=True)
+    (bake / "stage.json").write_text("{}")
+    assert batch(studies) == 0
+    row = rows_of(studies.parent / "out")["good"]
+    assert row["status"] == "done"
+    assert row["cause"].startswith("bake, report in ")
+    assert row["cause"].endswith("do not use them for this one")
+
+
+def test_a_name_of_two_lines_forges_no_row(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_study(studies / "new\nline done", "patient_id: p2\n")
+    assert batch(studies) == 0
+    printed = capsys.readouterr()
+    assert "new\\nline done" in printed.out
+    assert "new\\nline done" in printed.err
 
 
 def test_the_same_images_under_two_names_are_told(studies: Path) -> None:

@@ -101,6 +101,21 @@ def test_an_interrupted_batch_ends_its_studies_and_keeps_its_table(
     assert all(name in printed for name in rows)
 
 
+def test_a_killed_batch_leaves_a_table_that_says_so_and_its_studies_know(tmp_path: Path) -> None:
+    """Not that of last night, and not one of the studies that have ended alone."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "batch.csv").write_text("patient,status\nc,done\n")
+    with running(tmp_path, "b-watches") as batch:
+        batch.process.kill()
+        assert batch.told() == "orphaned"
+    rows = rows_of(batch.out)
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "a": "done",
+        "b-watches": "not ended",
+        "c": "not ended",
+    }
+
+
 def test_ctrl_c_again_ends_a_study_that_does_not_listen(tmp_path: Path) -> None:
     with running(tmp_path, "b-deaf") as batch:
         batch.process.send_signal(signal.SIGINT)
@@ -111,15 +126,6 @@ def test_ctrl_c_again_ends_a_study_that_does_not_listen(tmp_path: Path) -> None:
         batch.process.communicate(timeout=60)
         assert batch.process.returncode == 130
     assert rows_of(batch.out)["b-deaf"]["status"] == "interrupted"
-
-
-def test_a_killed_batch_leaves_the_table_of_what_ended_and_its_studies_know(
-    tmp_path: Path,
-) -> None:
-    with running(tmp_path, "b-watches") as batch:
-        assert set(rows_of(batch.out)) == {"a"}
-        batch.process.send_signal(signal.SIGKILL)
-        assert batch.told() == "orphaned"
 
 
 MEMBER = """

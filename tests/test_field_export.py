@@ -1,5 +1,6 @@
 """Exports of a field, read again by independent libraries and compared at places in the patient."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -239,14 +240,16 @@ def test_files_that_cannot_be_written_whole_are_refused_and_leave_nothing(path, 
 
 
 def test_what_a_killed_export_left_is_cleared_away_and_a_living_ones_is_not(path, tmp_path):
-    ended = subprocess.Popen(["true"])
-    ended.wait()
-    for pid in (ended.pid, os.getppid()):
-        (tmp_path / f".new.partial-{pid}").mkdir()
-    (tmp_path / ".newer.partial-1").mkdir()
+    for name in (f".new.partial-{os.getppid()}", ".newer.partial-1"):
+        (tmp_path / name).mkdir()
+    living = tmp_path / ".new.partial-1"
+    living.mkdir()
+    handle = os.open(living, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
     export_field(path, "sofa", tmp_path / "new")
+    os.close(handle)
     left = sorted(one.name for one in tmp_path.iterdir())
-    assert left == [f".new.partial-{os.getppid()}", ".newer.partial-1", "new"]
+    assert left == [".new.partial-1", ".newer.partial-1", "new"]
 
 
 def test_a_link_at_the_target_is_not_followed(path, tmp_path):

@@ -340,11 +340,26 @@ def test_killed_while_writing_leaves_the_old_product_and_is_cleared_away(tmp_pat
         process.wait()
     assert (target / "text").read_text() == "old"
     assert list(tmp_path.glob(f".*{PARTIAL}*"))
-    # What a process writes that lives, such as an export beside the run, is not in its way.
-    alive = tmp_path / f".export{PARTIAL}{os.getpid()}"
-    alive.mkdir()
-    with only_run_in(tmp_path):
-        assert list(tmp_path.glob(f".*{PARTIAL}*")) == [alive]
+    # What is being written, as by an export beside the run, is not in its way; a leftover is, also
+    # of a process that had the number of one that lives.
+    with publishing(tmp_path / "export") as alive:
+        (tmp_path / f".other{PARTIAL}{os.getppid()}").mkdir()
+        with only_run_in(tmp_path):
+            assert list(tmp_path.glob(f".*{PARTIAL}*")) == [alive]
+
+
+def test_what_was_killed_within_a_swap_is_in_nobodys_way(tmp_path: Path) -> None:
+    """In a container every run has the same number: the old product lies where the next one's
+    is to go."""
+    target = tmp_path / "stage"
+    for name in (f".stage{PARTIAL}old-{os.getpid()}", f".stage{PARTIAL}{os.getpid()}"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "text").write_text("left")
+    for content in ("old", "new"):
+        with publishing(target) as folder:
+            (folder / "text").write_text(content)
+        assert (target / "text").read_text() == content
+    assert [one.name for one in tmp_path.iterdir()] == ["stage"]
 
 
 @pytest.mark.parametrize(

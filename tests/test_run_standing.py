@@ -54,6 +54,33 @@ def test_nothing_is_made_of_a_product_that_was_altered(kitchen: Kitchen) -> None
     assert kitchen.text("c") == "c(a(first),b(a(first)))"
 
 
+def test_an_altered_product_does_not_stand(kitchen: Kitchen) -> None:
+    """It is not made anew unasked either: somebody may have corrected it by hand."""
+    kitchen.run()
+    text = kitchen.out / "p1" / "c" / "text"
+    text.write_text(text.read_text().replace("first", "f1rst"))
+    out = kitchen.out
+    with pytest.raises(InputError, match=rf"c/text: is not what .* --out {out} --from c") as caught:
+        kitchen.run()
+    assert not getattr(caught.value, "__notes__", [])
+    assert statuses(kitchen) == {"a": "done", "b": "done", "c": "failed"}
+    assert "f1rst" in text.read_text()
+    assert kitchen.run(first="c") == {"a": "unchanged", "b": "unchanged", "c": "done"}
+
+
+def test_what_holds_is_not_called_old_by_a_failure(kitchen: Kitchen) -> None:
+    """Made again of the same, as from a stage on: what stands is what it would have made."""
+    kitchen.run()
+    kitchen.bodies["b"] = stopped_by_a_fault
+    with pytest.raises(StageError) as caught:
+        kitchen.run(first="b")
+    assert not getattr(caught.value, "__notes__", [])
+
+
+def stopped_by_a_fault(_job: Job) -> dict[str, Any]:
+    raise StageError("no")
+
+
 def test_an_interrupted_run_tells_of_older_products(kitchen: Kitchen) -> None:
     kitchen.run()
     kitchen.bodies["b"] = stopped

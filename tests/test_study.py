@@ -401,7 +401,10 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
         ("us: {fill_gaps: true}", "us.fill_gaps: unknown key; it belongs under cine"),
         ("cine: {us: lab}", "cine.us: unknown key; it belongs at the top level or under ecg"),
         ("folder: cine", "folder: unknown key; check its spelling"),
-        ("patient_id: 7", r"patient_id: needs text; put it in quotes \(got 7\)"),
+        (
+            "patient_id: 7",
+            r"patient_id: needs text; put it in quotes as it stands in the file \(got 7\)",
+        ),
         ("patient_id: 2024-01-02", "patient_id: needs text; put it in quotes"),
         ("patient_id: A 7", "patient_id: needs letters, digits and '_ . -' alone"),
         (
