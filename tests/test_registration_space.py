@@ -307,6 +307,20 @@ class TestRefusals:
         assert (result.verdict == "good") != mirror_image
         assert ("a mirror image" in result.reason) == mirror_image
 
+    @pytest.mark.parametrize(
+        ("exchange", "told"),
+        [
+            (np.s_[:, :, ::-1], "mirrored from left to right (ImageToProbe"),
+            (np.s_[:, ::-1], "turned upside down (ImageToProbe"),
+        ],
+    )
+    def test_how_pictures_were_exchanged_is_told(self, recording, exchange, told):
+        sweeps = [replace(one, images=one.images[exchange]) for one in recording.sweeps]
+        start = start_off(recording, 100, 5, 5)
+        found = find(sweeps, recording.phases, moving_surfaces(), start, QUICK)
+        assert found.verdict == "failed"
+        assert f"; {told}" in found.reason
+
     def test_a_heart_of_another_rate_is_never_good(self, monkeypatch, recording):
         monkeypatch.setattr(stage, "register", lambda *given: given[-1])
         monkeypatch.setattr(stage, "read_cine", lambda _: None)

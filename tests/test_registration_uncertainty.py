@@ -220,6 +220,10 @@ class TestVerdict:
             ({"expected_mm": float("nan")}, "leave the pose open"),
             ({"expected_mm": 9.0, "size": Size(0.08, 0.1)}, "better with a heart 8% larger"),
             ({"confidence": 1.1}, "no pose to trust"),
+            (
+                {"confidence": 0.5, "misplaced": "mirrored"},
+                "; mirrored they agree 2.0 times better",
+            ),
             ({"rival": 0.95}, "two poses far apart"),
             ({"valid": 3}, "only 3 of 48"),
             ({"shift_mm": 31.0}, "31.0 mm"),
@@ -253,7 +257,7 @@ class TestVerdict:
         none = np.zeros(0, np.float32)
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
-        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": 0.0}
+        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": 0.0, "misplaced": ""}
         in_view = np.ones(40)
         level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
         found = SimpleNamespace(everything=level, bears_out=borne_out, pose=None, **sure)

@@ -160,6 +160,14 @@ def mirrored(sweep: TrackedSweep) -> TrackedSweep:
     return _displaced(sweep, "mirrored", sweep.images, sweep.tracker_from_image @ swap)
 
 
+def upside_down(sweep: TrackedSweep) -> TrackedSweep:
+    """The sweep with near and far exchanged."""
+    rows = np.flatnonzero(sector_of(sweep).any(axis=1))
+    swap = np.eye(4)
+    swap[1, 1], swap[1, 3] = -1, rows[0] + rows[-1]
+    return _displaced(sweep, "upside down", sweep.images, sweep.tracker_from_image @ swap)
+
+
 def backwards(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with its pictures in reverse order: each at the pose and phase of another."""
     return _displaced(sweep, "backwards", sweep.images[::-1], sweep.tracker_from_image)

@@ -42,8 +42,8 @@ class RegisterSettings(Section):
     """How many of the most promising poses are followed to their own optimum; without a start,
     eight times as many."""
     min_confidence: float = Field(1.6, gt=0)
-    """How many times as well as frames in the wrong place (mirrored, or in reverse order) the
-    frames must agree with the model; below, the registration is not trusted."""
+    """How many times as well as frames in the wrong place (mirrored, upside down, or in reverse
+    order) the frames must agree with the model; below, the registration is not trusted."""
     model_error_mm: float = Field(0.5, ge=0, le=10)
     """Standard deviation of what all frames share, such as the surfaces' error: along each axis in
     shift, and about each axis at the heart's own radius. No spread between frames shows it."""

@@ -3,7 +3,7 @@
 All frames of all sweeps, each at its own phase of the heartbeat, are compared at once with the
 moving surfaces. The search goes from thick blur to thin. What its result is worth is decided by
 its covariance, and by searching the same way with frames whose pictures are the same but in the
-wrong place (mirrored, or in reverse order): their best score is what chance reaches.
+wrong place (mirrored, upside down, or in reverse order): their best score is what chance reaches.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from pipeline.registration.breathing import follow_breath
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.correction import Correction
-from pipeline.registration.frames import TrackedSweep, backwards, mirrored
+from pipeline.registration.frames import (
+    TrackedSweep,
+    backwards,
+    mirrored,
+    upside_down,
+)
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
 from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
@@ -142,6 +147,8 @@ class _Found:
 
     size: Size
     apart: float
+    misplaced: str
+    """See `Evidence`."""
 
 
 def register(
@@ -229,7 +236,7 @@ def find(
     settled = settle_clock(search, best, compared, timing, settings.clock_offset)
     search, best = settled.search, settled.best
     tell(2, _STEPS)
-    chance = _by_chance(search, best.pose, compared)
+    chance, misplaced = _by_chance(search, best.pose, compared)
     tell(3, _STEPS)
     everything = search.fine_level(compared)
     sizes = [len(sweep.images) for sweep in sweeps]
@@ -244,7 +251,9 @@ def find(
     size = fitting_size(judged, pose, search.pivot, planes_of(cine))
     apart = _apart(everything, pose, search.pivot, sizes)
     sure = confidence, rival, settled.clock
-    found = _Found(pose, *sure, everything, calibration, breath_mm, bears_out, size, apart)
+    found = _Found(
+        pose, *sure, everything, calibration, breath_mm, bears_out, size, apart, misplaced
+    )
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -268,17 +277,26 @@ def require_frames(
         )
 
 
-def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> float:
-    """The best score that frames in the wrong place reach."""
+_WRONG_PLACES: Mapping[str, Callable[[TrackedSweep], TrackedSweep]] = {
+    "mirrored from left to right (ImageToProbe, UltrasoundImageOrientation)": mirrored,
+    "turned upside down (ImageToProbe, UltrasoundImageOrientation)": upside_down,
+    "in reverse order (time stamps)": backwards,
+}
+"""How frames are misplaced, and what to look at where they fit better so."""
+
+
+def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> tuple[float, str]:
+    """The best score that frames in the wrong place reach, and which place that is."""
     # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
     nearby = replace(search, start=pose) if search.start is None else search
 
     def reached(displaced: Callable[[TrackedSweep], TrackedSweep]) -> float:
         return nearby.best([displaced(sweep) for sweep in sweeps]).score
 
-    # Both at the same time: sums over samples let others run while they count.
+    # At the same time: sums over samples let others run while they count.
     with ThreadPoolExecutor(2) as pool:
-        return max(pool.map(reached, (mirrored, backwards)))
+        scores = pool.map(reached, _WRONG_PLACES.values())
+        return max(zip(scores, _WRONG_PLACES, strict=True))
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:
@@ -418,5 +436,6 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
         apart=found.apart,
+        misplaced=found.misplaced,
     )
     return judge(evidence, settings)
