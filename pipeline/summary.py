@@ -233,7 +233,8 @@ def _verdict(register: dict[str, Any]) -> list[str]:
         return []
     line = (
         f"{figures['verdict']}, expected error over the heart {figures['expected_tre_mm']:.1f} mm"
-        f" (under 2 mm with a chance of {figures['chance_under_2_mm']:.0%})"
+        f" (under 2 mm with a chance of {figures['chance_under_2_mm']:.0%}), borne out by "
+        f"{figures['valid']} of {figures['frames']} frames"
     )
     # Corrections are named only where the settings let calibrations be wrong.
     wider = ", widened by calibration: per_sweep" if figures["calibration"] else ""

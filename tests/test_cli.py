@@ -224,21 +224,22 @@ def test_stale_products_are_not_offered_as_if_they_were_current(tmp_path, state)
             "good",
             "",
             "",
-            "good, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%)",
+            "good, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%), "
+            "borne out by 78 of 80 frames",
         ),
         (
             "doubtful",
-            "30 of 80 frames bear the pose out",
+            "parts apart",
             "",
             "doubtful, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%), "
-            "because: 30 of 80 frames bear the pose out",
+            "borne out by 78 of 80 frames, because: parts apart",
         ),
         (
             "good",
             "",
             "calibration of left corrected by 0.2 ± 0.9 mm and 0.1 ± 0.8 degrees",
             "good, expected error over the heart 1.5 mm (under 2 mm with a chance of 96%), "
-            "widened by calibration: per_sweep",
+            "borne out by 78 of 80 frames, widened by calibration: per_sweep",
         ),
     ],
 )
@@ -250,6 +251,8 @@ def test_the_summary_says_what_the_registration_is_worth(
         "reason": reason,
         "expected_tre_mm": 1.541,
         "chance_under_2_mm": 0.957,
+        "valid": 78,
+        "frames": 80,
     }
     stage = {"status": "done", "figures": {**figures, "calibration": calibration}}
     record = {"status": "done", "stages": {"register": stage}}

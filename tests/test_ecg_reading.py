@@ -427,6 +427,13 @@ def test_of_groups_of_channels_the_longest_of_voltages_is_read(tmp_path):
     np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0)
 
 
+def test_a_group_that_begins_later_than_its_record_has_its_own_start(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    assert read_ecg(write_dicom(tmp_path / "ecg.dcm", [group])).start_s == 0
+    group.MultiplexGroupTimeOffset = "1250"
+    assert read_ecg(write_dicom(tmp_path / "ecg.dcm", [group])).start_s == 1.25
+
+
 def test_nanovolts_become_millivolts(tmp_path):
     stem = write_wfdb(tmp_path, units="nV")
     np.testing.assert_allclose(read_ecg(stem).signal_mv, STEPS_UV / 1000.0 * 1e-6, rtol=1e-9)

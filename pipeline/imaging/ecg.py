@@ -206,6 +206,8 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
         signal[_is_padding(dataset, index)] = np.nan
         channels = list(group.ChannelDefinitionSequence)
         rate_hz = float(group.SamplingFrequency)
+        # Of the acquisition's time, which is that of all groups.
+        start_s = float(group.get("MultiplexGroupTimeOffset") or 0) / 1000
         names = tuple(_lead_name(channel) for channel in channels)
         units = [str(c.ChannelSensitivityUnitsSequence[0].CodeValue) for c in channels]
     except (
@@ -217,7 +219,7 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
         ) from error
     scale = [millivolts(unit, str(path)) for unit in units]
     patient = str(dataset.get("PatientID", "") or "").strip()
-    return Ecg(signal * scale, names, rate_hz, patient=patient)
+    return Ecg(signal * scale, names, rate_hz, start_s, patient=patient)
 
 
 def patient_mark(patient: str) -> str:

@@ -37,7 +37,7 @@ def require_heart_in_view(level: Level, search: Search) -> None:
         inverse = replace(search, start=np.asarray(np.linalg.inv(search.start), dtype=float))
         inverted = _most_in_view(level, inverse) >= needed
         raise (InputError if inverted else UnregistrableError)(
-            f"of {frames} frames looked at, {seen} or fewer cross the heart at every pose within "
+            f"of {frames} frames looked at, at most {seen} cross the heart at any pose within "
             f"{settings.capture_mm:g} mm and {settings.capture_deg:g} degrees of the start; "
             + (_INVERTED if inverted else _MISPLACED)
         )
