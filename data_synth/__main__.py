@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,19 +14,43 @@ from typing import Any
 QUIET_S = 2.0
 """Work shorter than this shows no progress."""
 REFRESH_S = 0.5
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+INTERRUPTED_CODE = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit code: 0 done, 2 the command or the settings are wrong."""
+    """Run the command; the exit code: 0 done, 2 the command or the settings are wrong, 130 it was
+    told to end."""
     options = _parser().parse_args(arguments)
     from data_synth.errors import SynthError
 
     try:
+        _end_cleanly()
         _write_patients(options)
     except SynthError as error:
         sys.stderr.write(f"error: {error}\n")
         return SynthError.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; studies that are finished are kept\n")
+        return INTERRUPTED_CODE
     return 0
+
+
+def _end_cleanly() -> None:
+    """Let signals that end programs interrupt the work once, so that what is half-done is cleared
+    away; those that come meanwhile, as to all of a terminal's programs, are not heard."""
+
+    def interrupt(_number: int, _frame: object) -> None:
+        for one in heard:
+            signal.signal(one, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    # Python lets the main thread alone choose; those that are ignored, as `nohup` does, stay so.
+    if threading.current_thread() is not threading.main_thread():
+        return
+    heard = [one for one in ENDING if signal.getsignal(one) is not signal.SIG_IGN]
+    for one in heard:
+        signal.signal(one, interrupt)
 
 
 def _write_patients(options: argparse.Namespace) -> None:
@@ -75,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="folder to write patient-0001/ ... in"
     )
-    parser.add_argument("--seed", type=int, help="patient number k has seed N + k - 1 (default 1)")
+    parser.add_argument("--seed", type=int, help="patient number k has SEED + k - 1 (default 1)")
     parser.add_argument("--patients", type=int, default=1, metavar="N", help="how many (default 1)")
     parser.add_argument("--config", type=Path, metavar="YAML", help="settings of the phantom")
     parser.add_argument(

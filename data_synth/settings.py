@@ -54,7 +54,7 @@ class PhantomSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     seed: int = Field(default=1, ge=0)
-    """From which everything is drawn; patient k of a batch has the first one's seed + k."""
+    """From which everything is drawn; patient k of a batch has the first one's seed + k - 1."""
     patient_id: str = Field(default="patient-0001", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     """Name of the study's folder, and PatientID in DICOM; of one patient alone."""
     pathology: Pathology = "healthy"

@@ -103,10 +103,14 @@ def simulate_study(
     """
     heart = load_heart(settings)
     middle = done * 55 // 100
+    # What cannot be recorded is refused before minutes are spent on the rest.
+    us_ecg = None if settings.cine_only else _ultrasound_ecg(settings)
     mr_ecg, cine, views = _magnetic_resonance(settings, heart, share(progress, 0, middle))
-    if settings.cine_only:
+    if us_ecg is None:
         return SyntheticStudy(settings, heart, cine, views, mr_ecg, None, (), None)
-    us_ecg, sweeps = _ultrasound(settings, heart, share(progress, middle, done))
+    told, r_times_s = share(progress, middle, done), us_ecg.r_times_s
+    rng = stream(settings, ULTRASOUND)
+    sweeps = tuple(simulate_sweeps(rng, heart, r_times_s, settings.ultrasound, told))
     truth = sweeps[0].mr_from_tracker
     start = first_guess(stream(settings, START), truth, heart.centre_mm)
     return SyntheticStudy(settings, heart, cine, views, mr_ecg, us_ecg, sweeps, start)
@@ -127,7 +131,11 @@ def record_ecg(settings: PhantomSettings, part: int, needed_s: float) -> EcgSign
     duration_s = needed_s + 4 * 60 / slowest_bpm
     ecg = settings.ecg.away_from_scanner() if part == ULTRASOUND_ECG else settings.ecg
     mean_rr_s = 60 / settings.heart_rate_bpm
-    return simulate_ecg(stream(settings, part), duration_s, mean_rr_s, settings=ecg)
+    try:
+        return simulate_ecg(stream(settings, part), duration_s, mean_rr_s, settings=ecg)
+    except SynthError as error:
+        beside = "ultrasound" if part == ULTRASOUND_ECG else "MR"
+        raise SynthError(f"ECG beside {beside}: {error}") from error
 
 
 def _magnetic_resonance(
@@ -154,14 +162,10 @@ def _magnetic_resonance(
     return ecg, cine, views_of
 
 
-def _ultrasound(
-    settings: PhantomSettings, heart: BeatingHeart, progress: Progress | None
-) -> tuple[EcgSignal, tuple[Sweep, ...]]:
+def _ultrasound_ecg(settings: PhantomSettings) -> EcgSignal:
     preset = settings.ultrasound
     run_s = preset.frames / preset.frame_rate_hz
-    ecg = record_ecg(settings, ULTRASOUND_ECG, preset.sweeps * (run_s + SWEEP_PAUSE_S))
-    sweeps = simulate_sweeps(stream(settings, ULTRASOUND), heart, ecg.r_times_s, preset, progress)
-    return ecg, tuple(sweeps)
+    return record_ecg(settings, ULTRASOUND_ECG, preset.sweeps * (run_s + SWEEP_PAUSE_S))
 
 
 def first_guess(rng: np.random.Generator, mr_from_tracker: Float, centre_mm: Float) -> Float:

@@ -135,13 +135,12 @@ def publishing(target: Path) -> Iterator[Path]:
             target.rename(old)
         partial.rename(target)
     except OSError as error:
-        if old.exists() and not target.exists():
-            old.rename(target)
         raise SynthError(
             f"{target}: cannot be written ({error.strerror}: {error.filename or partial}); "
             "mend the place or choose another"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        if target.exists():
-            shutil.rmtree(old, ignore_errors=True)
+        if old.exists() and not target.exists():
+            old.rename(target)
+        shutil.rmtree(old, ignore_errors=True)

@@ -369,7 +369,14 @@ def synth(
     `beatfield synth --help` lists all options.
     """
     # A process of its own: the pipeline does not know the code that makes its test data.
-    return subprocess.call([sys.executable, "-m", "data_synth", *arguments])
+    with subprocess.Popen([sys.executable, "-m", "data_synth", *arguments]) as child:
+        try:
+            return child.wait()
+        except KeyboardInterrupt:
+            # It clears away what is half-done, which takes it a moment.
+            child.terminate()
+            child.wait()
+            raise
 
 
 @app.command

@@ -1,6 +1,11 @@
 """Whole synthetic studies on disk: readable by others, repeatable, refused when senseless."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import nibabel
@@ -315,6 +320,49 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("whole_group", [True, False], ids=["Ctrl-C", "SIGTERM to the program"])
+def test_an_interrupted_command_clears_away_what_is_half_done(tmp_path, whole_group):
+    """Ctrl-C goes to all programs of a terminal; the work is done by a child of the command."""
+    command = [sys.executable, "-m", "pipeline", "synth", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
+        while process.poll() is None and not list(tmp_path.iterdir()):
+            time.sleep(0.05)
+        if whole_group:
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.terminate()
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interruption_within_the_swap_leaves_the_old_study(tmp_path, monkeypatch):
+    with publishing(tmp_path / "p") as partial:
+        (partial / "text").write_text("old")
+    rename = Path.rename
+
+    def stopped(path, to):
+        if to == tmp_path / "p" and "partial" in path.name:
+            raise KeyboardInterrupt
+        return rename(path, to)
+
+    monkeypatch.setattr(Path, "rename", stopped)
+    with pytest.raises(KeyboardInterrupt), publishing(tmp_path / "p") as partial:
+        (partial / "text").write_text("new")
+    assert [one.name for one in tmp_path.iterdir()] == ["p"]
+    assert (tmp_path / "p" / "text").read_text() == "old"
+
+
+def test_what_the_short_record_cannot_hold_is_refused_at_once(tmp_path):
+    """The ultrasound's ECG lasts some seconds, the MR's minutes; neither is begun."""
+    told = []
+    settings = small(ecg={"fibrillation": True, "fibrillation_s": [60, 80]})
+    with pytest.raises(SynthError, match=r"^ECG beside ultrasound: fibrillation_s = .* lies past"):
+        simulate_study(settings, lambda done, _: told.append(done))
+    assert told == []
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):

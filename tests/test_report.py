@@ -316,6 +316,7 @@ def test_a_stack_without_a_right_ventricle_has_no_figures_of_one() -> None:
     assert [name for name, _ in heart.function_rows(known)] == [
         "LV volume, largest / smallest",
         "LV ejection fraction",
+        "LV stroke volume",
         "LV mass",
     ]
 
@@ -396,6 +397,7 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
         "stiffness_n_per_m": 321.4,
         "stiffness_measured_n_per_m": 391.2,
         "stiffness_any_direction_p99_n_per_m": 323.0,
+        "stiffness_any_direction_max_n_per_m": 1237.0,
         "stiffness_limit_n_per_m": 400.0,
         "beyond_limit_share": 0.0019,
         "force_step_max_n_per_0_1_mm": 0.4284,
@@ -416,8 +418,8 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
         {"node_error_near_mm": 0.001, "sign_errors": 0},
     )
     assert forces.rows == [
-        ("soft", "321", "391", "323", "400", "0.2%", "0.43", "0.153"),
-        ("stiff", "384", "525", "323", "unknown", "unknown", "0.43", "unknown"),
+        ("soft", "321", "391", "323", "1237", "400", "0.2%", "0.43", "0.153"),
+        ("stiff", "384", "525", "323", "1237", "unknown", "unknown", "0.43", "unknown"),
     ]
     assert len(forces.head) == len(forces.rows[0])
     assert kept.rows == [

@@ -12,15 +12,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.config import Settings
+from pipeline.geometry import MovingSurface
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
+from pipeline.products import FrameRow
 from pipeline.report import pictures, slices
 from pipeline.report.animation import _webp, first_frame
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, render
-from pipeline.stages.report import _of_whole_ventricles, _opening, _registration_notes
-from pipeline.summary import remarks
+from pipeline.stages.report import (
+    _frames_shown,
+    _of_whole_ventricles,
+    _opening,
+    _registration_notes,
+)
+from pipeline.summary import doubts, remarks
 
 
 def notes(us: object, figures: dict[str, Any] | None) -> list[str]:
@@ -59,10 +67,20 @@ def test_doubts_and_corrections_stand_at_the_top(figures: dict[str, Any], told: 
     assert notes(object(), figures) == told
 
 
-def opening(us: object, verdict: str | None, doubtful: bool, truth: bool) -> Opening:
+def opening(
+    us: object,
+    verdict: str | None,
+    doubtful: bool,
+    truth: bool,
+    cut_off: dict[str, dict[int, int]] | None = None,
+) -> Opening:
     """Of a study whose other stages found nothing amiss, or a slice of low confidence."""
     figures: dict[str, Any] = {
-        "segment": {"orientation": str(AS_THE_FILE_SAYS), "cut_off": {}, "cut_sideways": {}},
+        "segment": {
+            "orientation": str(AS_THE_FILE_SAYS),
+            "cut_off": cut_off or {},
+            "cut_sideways": {},
+        },
         "ingest": {"remarks": [], "interpolated_slices": [3] if doubtful else [], "phases": 9},
         "surface": {"left_out": {}},
         "bake": {"left_out": {}},
@@ -74,6 +92,7 @@ def opening(us: object, verdict: str | None, doubtful: bool, truth: bool) -> Ope
         product=lambda stage: Path(stage) if made[stage] else None,
         figures=figures.__getitem__,
         skipped={"register": "frames agree with nothing"},
+        settings=Settings(),
     )
     return _opening(cast(Job, job))
 
@@ -94,6 +113,44 @@ def test_the_page_begins_with_what_the_field_is_worth(
     said = opening(us, verdict, doubtful, truth=True)
     assert said.headline.startswith(headline)
     assert any("not for use on patients" in text for text in said.told)
+
+
+@pytest.mark.parametrize(
+    ("body", "warned"), [("aorta", False), ("left atrium", True), ("right ventricle", True)]
+)
+def test_what_is_cut_off_and_of_no_fixture_is_no_warning(body: str, warned: bool) -> None:
+    """The default fixtures lie at the left ventricle and the left atrium; ejection is told too."""
+    said = opening(object(), "good", False, truth=True, cut_off={body: {11: 9}})
+    assert any(body in text for text in said.warnings) == warned
+    assert any(body in text for text in said.told) != warned
+
+
+def test_ventricles_that_eject_unequally_are_told_unless_one_is_cut_off() -> None:
+    surface = {"volumes_ml": {"lv_endocardium": [150.0, 70.0], "rv_endocardium": [160.0, 95.0]}}
+    [said] = doubts({}, surface)
+    assert said.startswith("volumes: the left ventricle ejects 80 ml and the right one 65 ml;")
+    assert doubts({"cut_off": {"right ventricle": {11: 9}}}, surface) == []
+    surface["volumes_ml"]["rv_endocardium"] = [160.0, 91.0]
+    assert doubts({}, surface) == []
+
+
+def test_lines_on_a_frame_are_those_of_its_own_phase() -> None:
+    """Between two stored phases, and between the last and the first of the next beat."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    moving = MovingSurface(
+        np.stack([corners, corners + 4, corners + 1]),
+        np.array([[0, 1, 2]]),
+        np.array([0.1, 0.5, 0.7]),
+    )
+    for phase, off in ((0.1, 0), (0.2, 1), (0.5, 4), (0.6, 2.5), (0.7, 1), (0.9, 0.5), (0.0, 0.25)):
+        found = pictures._between(moving, phase).vertices_mm
+        np.testing.assert_allclose(found, corners + off, atol=1e-12)
+
+
+def test_a_frame_that_speaks_against_a_registration_is_shown() -> None:
+    rows = [FrameRow("a", k, k / 20, 0.1, 0.4 + 0.6 * (k == 30), k < 25) for k in range(31)]
+    assert [row.frame for row in _frames_shown(rows)] == [0, 12, 24, 27]
+    assert [row.frame for row in _frames_shown(rows[:25])] == [0, 8, 16, 24]
 
 
 def test_what_of_the_folder_is_not_used_is_told_in_one_line() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from data_synth.ecg import EcgSettings, simulate_ecg, write_wfdb
 from pipeline.cli import main
+from pipeline.registration.rhythm import RhythmBeat, unordered
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +114,16 @@ def test_trouble_ends_with_exit_code_2_and_no_file(ecg, tmp_path, capsys, record
     assert main(["rpeaks", str(tmp_path / record), "--out", str(tmp_path / out)]) == 2
     assert words in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_rhythm_in_which_forces_are_withheld_is_told_of_a_study():
+    """One beat in five that is not normal is a few extrasystoles; more is no rhythm to rely on."""
+
+    def row(kind, rr_s):
+        return RhythmBeat(1.0, kind, True, 0, rr_s, 1.0, 1.1, False)
+
+    usual = [row("normal", math.nan), *[row("normal", 0.8)] * 15]
+    assert unordered([*usual, *[row("ectopic", 0.5)] * 4]) == ""
+    said = unordered([*usual, *[row("ectopic", 0.5)] * 2, *[row("irregular", 1.31)] * 3])
+    assert said == "of 21 beats 2 are ectopic and 3 irregular, 0.50 to 1.31 s apart"
+    assert unordered([]) == ""

@@ -126,7 +126,7 @@ def heart_blocks(number: int, settings: PoolSettings) -> Label:
     ill = rng.random() < ILL_SHARE
     pathology = str(rng.choice(PATHOLOGIES)) if ill else "healthy"
     heart = draw_heart(rng, settings.spread, pathology, rng.uniform(*HEART_RATES_BPM))
-    # Half of the moments are drawn near end-systole, where the cavity is smallest and hardest.
+    # One of a heart's three moments is near end-systole, where the cavity is smallest and hardest.
     phases = [
         rng.uniform(0.0, 1.0) if k % 2 == 0 else rng.normal(heart.pulse.end_systole, 0.07)
         for k in range(settings.blocks_per_heart)
@@ -169,7 +169,7 @@ def fill_pool(
 def _hearts(numbers: Sequence[int], settings: PoolSettings, workers: int) -> Iterator[Label]:
     """Blocks of each heart in turn."""
     every = [settings] * len(numbers)
-    if workers == 1:
+    if workers <= 1:
         yield from map(heart_blocks, numbers, every)
     else:
         with ProcessPoolExecutor(workers) as pool:

@@ -18,6 +18,9 @@ from pipeline.registration.rpeaks import Beat, RPeakDetector, with_end_held
 NOMINAL_RR_S = 0.8
 # How often the clock is asked: often enough to see a lead come off for less than a beat.
 _STEP_S = 0.02
+_NOT_NORMAL: tuple[Kind, Kind] = ("ectopic", "irregular")
+# Share of beats that are not normal, beyond which a rhythm is told of.
+_MANY = 0.2
 _COLUMNS = ("time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s", "strange")
 
 
@@ -105,6 +108,18 @@ def tell(clock: PhaseClock, beat: Beat) -> Kind | None:
 def _row(beat: Beat, kind: Kind, valid: bool, rr_s: float) -> RhythmBeat:
     told = beat.lead, rr_s, beat.likeness, beat.known_s, beat.strange
     return RhythmBeat(beat.time_s, kind, valid, *told)
+
+
+def unordered(beats: Sequence[RhythmBeat]) -> str:
+    """How many beats of a recording are ectopic or without order, if many; else empty."""
+    ectopic, irregular = (sum(one.kind == kind for one in beats) for kind in _NOT_NORMAL)
+    if ectopic + irregular <= _MANY * len(beats):
+        return ""
+    intervals_s = [one.rr_s for one in beats if math.isfinite(one.rr_s)]
+    return (
+        f"of {len(beats)} beats {ectopic} are ectopic and {irregular} irregular, "
+        f"{min(intervals_s):.2f} to {max(intervals_s):.2f} s apart"
+    )
 
 
 def doubt(beats: Sequence[RhythmBeat]) -> str:

@@ -127,6 +127,9 @@ def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
     is good where its expected error is small, most frames bear it out and none of that is near.
     """
     failures, of_size = _failures(evidence, settings), _doubts_of_size(evidence.size)
+    if failures and evidence.confidence < 1:
+        # Where frames fit better in the wrong place, a size that fits better there says nothing.
+        return Verdict("failed", "; ".join(failures))
     if failures:
         # A wrong size widens the expected error: where that fails, it is the cause.
         return Verdict("failed", "; ".join([*of_size, *failures]))

@@ -41,7 +41,7 @@ def segmentation(shown: Moments, confidence: Float, low: float) -> Section:
 def _seen(shown: Moments, confidence: Float, always: list[int]) -> str:
     count = shown.labels.shape[1]
     chosen = len(slices.shown_slices(shown.labels, always))
-    text = "Chambers and heart muscle on the cine's own slices."
+    text = "Chambers and heart muscle on the cine's own slices, counted from 0, as phases are."
     if chosen < count:
         text += f" {chosen} of the {count} slices are shown."
     text += f" {slices.how_it_lies(shown)}"
@@ -109,5 +109,6 @@ def function_rows(measures: Mapping[str, Any]) -> list[tuple[str, str]]:
             (f"{short} volume, largest / smallest", f"{largest:.0f} / {smallest:.0f} ml"),
         )
         rows.append((f"{short} ejection fraction", f"{100 * (1 - smallest / largest):.0f} %"))
+        rows.append((f"{short} stroke volume", f"{largest - smallest:.0f} ml"))
     rows.append(("LV mass", f"{mean_lv_mass_g(measures):.0f} g"))
     return rows

@@ -20,7 +20,6 @@ from pipeline.geometry import (
     Float32,
     MovingSurface,
     Surface,
-    nearest_phase,
     transform_points,
 )
 from pipeline.imaging.labels import LABELS
@@ -150,13 +149,22 @@ def _draw_cuts(
     for name, (colour, style) in SURFACE_STYLES.items():
         if name not in surfaces:
             continue
-        moving = surfaces[name]
         # Joined, for dashes begin anew with every piece, and pieces are shorter than they.
-        nearest = moving.at(nearest_phase(moving.phases, phase))
-        lines = joined(plane_cut(nearest, image_from_mr))
+        lines = joined(plane_cut(_between(surfaces[name], phase), image_from_mr))
         axis.add_collection(LineCollection(lines, colors=colour, linestyles=style, linewidths=1.2))
     rows, columns = shape
     axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+
+
+def _between(moving: MovingSurface, phase: float) -> Surface:
+    """The surface at any phase, its vertices on straight lines between the stored ones."""
+    ends = np.append(moving.phases, moving.phases[0] + 1)
+    turned = moving.phases[0] + (phase - moving.phases[0]) % 1.0
+    before = int(np.searchsorted(ends, turned, side="right")) - 1
+    share = (turned - ends[before]) / (ends[before + 1] - ends[before])
+    after = (before + 1) % len(moving.phases)
+    vertices_mm = (1 - share) * moving.vertices_mm[before] + share * moving.vertices_mm[after]
+    return Surface(vertices_mm, moving.triangles)
 
 
 def plane_cut(surface: Surface, image_from_mr: Float) -> Float:

@@ -21,6 +21,7 @@ from pipeline.products import (
     write_table,
 )
 from pipeline.registration.clock_offset import Timing
+from pipeline.registration.rhythm import read_rhythm, unordered
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import Registration, register, require_frames
 from pipeline.registration.time import detect_r_peaks, in_known_beats, median_rr_s, phases_at
@@ -57,11 +58,12 @@ def run(job: Job) -> dict[str, Any]:
         "good_tre_mm": job.settings.register_.good_tre_mm,
         "worst_tre_mm": job.settings.register_.worst_tre_mm,
         "chance_under_2_mm": round(found.chance_under_2_mm, 3),
+        "breath": job.settings.register_.breath,
         "breath_range_mm": round(float(np.ptp(found.breath_mm)), 2),
         "calibration": "; ".join(one.words() for one in found.corrections),
         "median_rr_s": round(median_rr_s(r_times_s), 4),
         **_clock_figures(found),
-        "remarks": [*remarks_on(sweeps), *_doubts_of_patient(job, ecg)],
+        "remarks": [*remarks_on(sweeps), *_doubts_of_patient(job, ecg), *_doubts_of_rhythm(ecg)],
     }
 
 
@@ -154,6 +156,13 @@ def _ecg(study: Study) -> Ecg:
 def _doubts_of_patient(job: Job, ecg: Ecg) -> list[str]:
     assert job.study.ecg.us is not None, "a study with ultrasound has its ECG"
     return other_patient(ecg, job.figures("ingest")["patient_mark"], job.study.ecg.us)
+
+
+def _doubts_of_rhythm(ecg: Ecg) -> list[str]:
+    """A sentence where a force server would withhold forces for much of the time."""
+    beats = read_rhythm(ecg.signal_mv, ecg.sampling_rate_hz)
+    said = unordered(beats)
+    return [f"the ultrasound's ECG: {said}; forces are withheld in such a rhythm"] if said else []
 
 
 def _doubts_of_images(job: Job) -> list[str]:

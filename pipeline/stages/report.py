@@ -15,7 +15,7 @@ from pipeline.imaging.settings import LOW_CONFIDENCE
 from pipeline.imaging.ultrasound import read_sweeps
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
-from pipeline.products import read_cine, read_frames, read_surfaces, read_table
+from pipeline.products import FrameRow, read_cine, read_frames, read_surfaces, read_table
 from pipeline.registration.correction import put_right
 from pipeline.registration.reading import Reader
 from pipeline.registration.uncertainty import expected_tre_mm
@@ -35,6 +35,12 @@ from pipeline.summary import (
 )
 
 ULTRASOUND_FRAMES_SHOWN = 4
+VENTRICLES = {"left ventricle", "right ventricle"}
+"""Their volumes are told at the top of the page, whatever the fixtures."""
+NOT_USED_TOLD = (
+    "The last frame is one of those that do not bear the registration out: it shows something "
+    "else, or the heart beside its place. "
+)
 BLOOD_TOLD = (
     "The second row shows where blood of the cavities was found in the same frames, light where it "
     "is certain: this is what the surfaces were laid over, and it should fill the lines of the "
@@ -97,7 +103,8 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     rows = [
         (
             "cine",
-            f"{ingest['slices']} slices, {ingest['phases']} phases, {ingest['timing_source']}",
+            f"{ingest['slices']} slices, {ingest['phases']} phases, {_views(ingest)}, "
+            f"{ingest['timing_source']}",
         ),
         ("heart rate", f"{60 / ingest['rr_s']:.0f} beats/min"),
         *_of_whole_ventricles(heart.function_rows(measures), _cut(job)),
@@ -108,7 +115,8 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     ]
     if job.product("register"):
         register = job.figures("register")
-        rows.append(("ultrasound frames used", f"{register['valid']} of {register['frames']}"))
+        rows.append(("ultrasound frames used", _frames_used(job)))
+        rows.append(("breath", _breath(register)))
         said = [register["verdict"], register["reason"], register["calibration"]]
         rows.append(("registration", "; ".join(filter(None, said))))
         expected_mm, chance = register["expected_tre_mm"], register["chance_under_2_mm"]
@@ -120,10 +128,47 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
     return rows
 
 
+def _views(ingest: dict[str, Any]) -> str:
+    """How many long-axis views take part: they show the base and the tip."""
+    count = len(ingest["long_axis"])
+    return {0: "no long-axis view", 1: "1 long-axis view"}.get(count, f"{count} long-axis views")
+
+
+def _frames_used(job: Job) -> str:
+    """Of all sweeps, and of each."""
+    rows = read_frames(job.products / "register" / "frames.csv")
+    names = dict.fromkeys(row.sweep for row in rows)
+    of_each = [[row.valid for row in rows if row.sweep == name] for name in names]
+    each = [f"{n} {sum(used)} of {len(used)}" for n, used in zip(names, of_each, strict=True)]
+    total = f"{sum(row.valid for row in rows)} of {len(rows)}"
+    return f"{total} ({', '.join(each)})" if len(each) > 1 else total
+
+
+def _breath(register: dict[str, Any]) -> str:
+    """Where in the breath the field belongs, and what of breathing was found."""
+    there = "the field is for the heart where the MR's breath-holds had it"
+    if register["breath"] == "hold":
+        return f"taken as held (register.breath: hold); {there}"
+    return f"free, the heart moved by {register['breath_range_mm']:.1f} mm; {there}"
+
+
 def _cut(job: Job) -> set[str]:
     """Names of what ends where the images do."""
     figures = job.figures("segment")
     return {*figures["cut_off"], *figures["cut_sideways"]}
+
+
+def _cut_off(job: Job, of_field: bool) -> dict[str, dict[Any, int]]:
+    """What the stack's ends cut off of ventricles and of the field's structures, or of others."""
+    left_out = job.figures("bake")["left_out"]
+    given = job.settings.fixtures.items()
+    used = {one.structure.replace("_", " ") for name, one in given if name not in left_out}
+    matters = used | VENTRICLES
+    return {
+        body: ends
+        for body, ends in job.figures("segment")["cut_off"].items()
+        if (body in matters or "heart" in used) == of_field
+    }
 
 
 def _of_whole_ventricles(
@@ -155,6 +200,8 @@ def _opening(job: Job) -> Opening:
         )
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
+    for text in cut_off_by(_cut_off(job, of_field=False), job.figures("ingest")):
+        told.append(f"Cut off by the stack's end, and of no fixture: {text}.")
     unused = series_left_out(job.figures("ingest"))
     told += [f"Of the cine's folder nothing is made of {text}." for text in unused]
     return Opening(f"{where} {found}", warnings, told)
@@ -178,7 +225,7 @@ def _warnings(job: Job) -> list[str]:
         notes.append(f"Not recorded or spoilt, so drawn between their neighbours: slices {named}.")
     told = doubts(job.figures("segment"), job.figures("surface"))
     notes += [f"Doubtful {text}." for text in told]
-    for text in cut_off_by(job.figures("segment")["cut_off"], ingest):
+    for text in cut_off_by(_cut_off(job, of_field=True), ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
     for text in cut_sideways_by(job.figures("segment")["cut_sideways"], ingest):
         notes.append(f"Cut off: {text}.")
@@ -210,8 +257,7 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
     found = read_table(folder / "mr_from_tracker.json")
     mr_from_tracker = np.array(found["mr_from_tracker"])
     covariance, centre_mm = np.array(found["covariance"]), np.array(found["centre_mm"])
-    rows = [row for row in read_frames(folder / "frames.csv") if row.valid]
-    chosen = [rows[k] for k in np.linspace(0, len(rows) - 1, ULTRASOUND_FRAMES_SHOWN).astype(int)]
+    chosen = _frames_shown(read_frames(folder / "frames.csv"))
     sweeps = {sweep.name: sweep for sweep in read_sweeps(job.study.us)}
     places = [sweeps[row.sweep].numbers.tolist().index(row.frame) for row in chosen]
     # Probes differ, and so may the sizes of their pictures.
@@ -226,7 +272,7 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             for row, at in zip(chosen, places, strict=True)
         ]
     )
-    names = [f"{row.sweep}, frame {row.frame}" for row in chosen]
+    names = [f"{row.sweep}, {row.frame}" + ("" if row.valid else ", NOT USED") for row in chosen]
     phases = np.array([row.phase for row in chosen])
     blood = []
     if job.figures("register")["reading"] == "network":
@@ -243,6 +289,7 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             "Registration",
             "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
             "phase of the heartbeat. Where the lines follow the walls, the registration holds. "
+            + ("" if all(row.valid for row in chosen) else NOT_USED_TOLD)
             + (BLOOD_TOLD if blood else "")
             + "At last, how far off it is to be expected at each place of the heart.",
             [
@@ -255,6 +302,16 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             ],
         )
     ]
+
+
+def _frames_shown(rows: list[FrameRow]) -> list[FrameRow]:
+    """Frames that bear the registration out, evenly, and the middle one of those that do not."""
+    used = [row for row in rows if row.valid]
+    # Of a residual of 1 nothing could be compared: the probe was in air, say.
+    against = [row for row in rows if not row.valid and row.residual < 1]
+    count = ULTRASOUND_FRAMES_SHOWN - bool(against)
+    chosen = [used[k] for k in np.linspace(0, len(used) - 1, count).astype(int)]
+    return chosen + against[len(against) // 2 :][:1]
 
 
 def _field(job: Job, shown: Moments) -> Section:
@@ -286,8 +343,8 @@ def _field(job: Job, shown: Moments) -> Section:
         "between two phases (unknown where there are two phases only: how it goes from one to the "
         "other is then a guess); the band is what lies within it of the surface. A device has to "
         "render the fixture's stiffness, which is below its limit; what is measured exceeds it at "
-        "single places beside a medial axis, where two parts of the surface are equally near, and "
-        "where the force changes with place as fast as the grid's spacing allows.",
+        "the share of places that is told: beside a medial axis, where two parts of the surface "
+        "are equally near and the force changes with place as fast as the grid's spacing allows.",
         [
             picture("Potential, distance and force", as_png(figure), "png"),
             picture("Force of each fixture", as_svg(profiles), "svg"),

@@ -328,7 +328,7 @@ def fill_pool(
 
 def _hearts(numbers: Sequence[int], frames: int, workers: int) -> Iterator[list[Picture]]:
     every = [frames] * len(numbers)
-    if workers == 1:
+    if workers <= 1:
         yield from map(heart_pictures, numbers, every)
     else:
         with ProcessPoolExecutor(workers) as pool:
