@@ -272,7 +272,9 @@ def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]
             for row, at in zip(chosen, places, strict=True)
         ]
     )
-    names = [f"{row.sweep}, {row.frame}" + ("" if row.valid else ", NOT USED") for row in chosen]
+    names = [
+        ("" if row.valid else "NOT USED:\n") + f"{row.sweep}, frame {row.frame}" for row in chosen
+    ]
     phases = np.array([row.phase for row in chosen])
     blood = []
     if job.figures("register")["reading"] == "network":
