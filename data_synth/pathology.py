@@ -9,7 +9,8 @@ Defining measures:
   (definition of Elliott et al., Eur. Heart J. 35:2733-2779, 2014).
 - dilated right ventricle: end-diastolic volume of at least 110 ml/m2 in men, 100 ml/m2 in women
   with an ejection fraction of at most 45 % (task force criteria of 2010; te Riele et al.,
-  J. Cardiovasc. Magn. Reson. 16:50, 2014).
+  J. Cardiovasc. Magn. Reson. 16:50, 2014). The volume is drawn so; the fraction follows from the
+  stroke, and is more than 45 % in one in ten.
 - infarct: a segment in the territory of one coronary artery that does not contract, its wall
   scarred and thinned to less than 5.5 mm, which speaks against viability (Lopez-Lereu et al.,
   Rev. Esp. Cardiol. 57:826-833, 2004).
@@ -84,7 +85,8 @@ def make_ill(
 
 
 def _dilated(rng: np.random.Generator, person: Person, shape: Shape, pulse: Pulse) -> Ill:
-    """Large, round, weak left ventricle; the right one ejects as little."""
+    """Large, round, weak left ventricle; the right one ejects as little, or as much as it can where
+    that is less."""
     # Two deviations above the mean: 218 ml in men, 187 ml in women (Hudsmith et al. 2005).
     lv_ml = (218 if person.male else 187) * rng.uniform(1.08, 1.4)
     longer = (lv_ml / person.lv_ml) ** 0.22
