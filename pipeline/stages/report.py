@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import __version__
+from pipeline.field.fixture import Fixture
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.cine import Cine
@@ -19,10 +21,9 @@ from pipeline.products import FrameRow, read_cine, read_frames, read_surfaces, r
 from pipeline.registration.correction import put_right
 from pipeline.registration.reading import Reader
 from pipeline.registration.uncertainty import expected_tre_mm
-from pipeline.report import certainty, certificate, heart, pictures
+from pipeline.report import certainty, certificate, heart, pictures, slices
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
-from pipeline.report.slices import lowest_place
 from pipeline.report.style import as_png, as_svg, as_webp
 from pipeline.summary import (
     by_reason,
@@ -40,6 +41,18 @@ VENTRICLES = {"left ventricle", "right ventricle"}
 NOT_USED_TOLD = (
     "The last frame is one of those that do not bear the registration out: it shows something "
     "else, or the heart beside its place. "
+)
+FIELD_TOLD = (
+    "The epicardium is the outside of the left ventricle's muscle: its free wall, the right side "
+    "of the septum, and a lid at the valves. The potential over an MR slice, lines of equal "
+    "distance every 5 mm (the surface is bold) and arrows of force. Of the certificate: p99 is "
+    "what 99 places in 100 keep under; sign errors are places taken for the wrong side; drift is "
+    "how far the surface lies off halfway between two phases (unknown where there are two phases "
+    "only: how it goes from one to the other is then a guess); the band is what lies within it of "
+    "the surface. A device has to render the fixture's stiffness, which is below its limit; what "
+    "is measured exceeds it at the share of places that is told: beside a medial axis, where two "
+    "parts of the surface are equally near and the force changes with place as fast as the grid's "
+    "spacing allows."
 )
 BLOOD_TOLD = (
     "The second row shows where blood of the cavities was found in the same frames, light where it "
@@ -70,7 +83,7 @@ def run(job: Job) -> dict[str, Any]:
         _summary(job, measures, confidence),
         sections,
         job.figures("bake")["example"],
-        _opening(job),
+        _opening(job, len(slices.doubts(confidence, LOW_CONFIDENCE))),
     )
     (job.folder / "index.html").write_text(page, encoding="utf-8", errors="backslashreplace")
     return {"pictures": sum(len(section.pictures) for section in sections)}
@@ -110,7 +123,7 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
         *_of_whole_ventricles(heart.function_rows(measures), _cut(job)),
         (
             "lowest confidence of the labels",
-            f"{lowest_place(confidence)}; doubtful below {LOW_CONFIDENCE:.2f}",
+            f"{slices.lowest_place(confidence)}; doubtful below {LOW_CONFIDENCE:.2f}",
         ),
     ]
     if job.product("register"):
@@ -124,7 +137,7 @@ def _summary(job: Job, measures: dict[str, Any], confidence: Float) -> list[tupl
         worth += f"{register['worst_tre_mm']:g} mm; under 2 mm with a chance of {chance:.0%}"
         rows.append(("expected registration error over the heart", worth))
     off_mm = accuracy["surface_error_p99_mm"]
-    rows.append(("error of the field on the surface, 99 places in 100", f"{off_mm:.2f} mm"))
+    rows.append(("field off the surfaces that were found, 99 places in 100", f"{off_mm:.2f} mm"))
     return rows
 
 
@@ -183,8 +196,9 @@ def _of_whole_ventricles(
     ]
 
 
-def _opening(job: Job) -> Opening:
-    """Whether the field may be used, as far as the program can tell, and why not."""
+def _opening(job: Job, doubtful: int = 0) -> Opening:
+    """Whether the field may be used, as far as the program can tell, and why not; ``doubtful`` is
+    the number of slices of low confidence."""
     warnings = _warnings(job)
     where = "Not registered: no tracked ultrasound, so a field in the frame of the MR alone."
     if job.product("register"):
@@ -200,8 +214,11 @@ def _opening(job: Job) -> Opening:
         )
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
+    if doubtful:
+        told.append(f"{doubtful} slices are of low confidence in some phase: see Segmentation.")
     for text in cut_off_by(_cut_off(job, of_field=False), job.figures("ingest")):
         told.append(f"Cut off by the stack's end, and of no fixture: {text}.")
+    told.append(f"Made by beatfield {__version__}; products and settings are those of run.json.")
     unused = series_left_out(job.figures("ingest"))
     told += [f"Of the cine's folder nothing is made of {text}." for text in unused]
     return Opening(f"{where} {found}", warnings, told)
@@ -326,6 +343,7 @@ def _field(job: Job, shown: Moments) -> Section:
             fixture_name,
             fixture.structure,
             " ".join(filter(None, (fixture.kind.replace("_", " "), fixture.side))),
+            _what_it_does(fixture),
             f"{fixture.resolved_gamma_mm:.2f}",
             f"{fixture.resolved_delta_mm:.2f}",
             str(fixture.m),
@@ -335,18 +353,11 @@ def _field(job: Job, shown: Moments) -> Section:
         )
         for fixture_name, fixture in field.fixtures.items()
     ]
-    head = ["fixture", "surface", "kind", "gamma mm", "delta mm", "m"]
+    head = ["fixture", "surface", "kind", "a tool", "gamma mm", "delta mm", "m"]
     head += ["most force N", "stiffness N/m", "device"]
     return Section(
         "Force field",
-        "The potential over an MR slice, lines of equal distance every 5 mm (the surface is bold) "
-        "and arrows of force. Of the certificate: p99 is what 99 places in 100 keep under; sign "
-        "errors are places taken for the wrong side; drift is how far the surface lies off halfway "
-        "between two phases (unknown where there are two phases only: how it goes from one to the "
-        "other is then a guess); the band is what lies within it of the surface. A device has to "
-        "render the fixture's stiffness, which is below its limit; what is measured exceeds it at "
-        "the share of places that is told: beside a medial axis, where two parts of the surface "
-        "are equally near and the force changes with place as fast as the grid's spacing allows.",
+        FIELD_TOLD,
         [
             picture("Potential, distance and force", as_png(figure), "png"),
             picture("Force of each fixture", as_svg(profiles), "svg"),
@@ -359,6 +370,13 @@ def _field(job: Job, shown: Moments) -> Section:
             ),
         ],
     )
+
+
+def _what_it_does(fixture: Fixture) -> str:
+    """What becomes of a tool near the surface, in words."""
+    if fixture.kind == "guidance":
+        return "is drawn to the surface from either side"
+    return f"{fixture.side} the surface is pushed out of there"
 
 
 def _evaluation(job: Job) -> list[Section]:
