@@ -14,7 +14,8 @@ from data_synth.training.ultrasound import pictures
 from data_synth.training.ultrasound.pictures import BLOOD, OUTSIDE, heart_pictures
 from pipeline.errors import InputError, StageError
 from pipeline.registration import reading
-from pipeline.registration.frames import DisplacedSweep, mirrored, sample_frames
+from pipeline.registration.frames import DisplacedSweep, sample_frames
+from pipeline.registration.misplaced import mirrored
 from pipeline.registration.reading import PIXEL_MM, Reader, as_compared, normalise
 from pipeline.registration.sector import shown_sector
 from pipeline.registration.settings import RegisterSettings

@@ -47,7 +47,7 @@ class BloodSweep:
 
 @dataclass(frozen=True, slots=True)
 class DisplacedSweep:
-    """A sweep whose pictures stand in the wrong place; see `mirrored` and `backwards`."""
+    """A sweep whose pictures stand in the wrong place; see `pipeline.registration.misplaced`."""
 
     name: str
     images: Float32
@@ -150,36 +150,6 @@ def sample_frames(
             "taken in air; was the probe in contact?"
         )
     return _join(parts)
-
-
-def mirrored(sweep: TrackedSweep) -> TrackedSweep:
-    """The sweep with left and right exchanged: the same pictures and sector, no anatomy."""
-    columns = np.flatnonzero(sector_of(sweep).any(axis=0))
-    swap = np.eye(4)
-    swap[0, 0], swap[0, 3] = -1, columns[0] + columns[-1]
-    return _displaced(sweep, "mirrored", sweep.images, sweep.tracker_from_image @ swap)
-
-
-def upside_down(sweep: TrackedSweep) -> TrackedSweep:
-    """The sweep with near and far exchanged."""
-    rows = np.flatnonzero(sector_of(sweep).any(axis=1))
-    swap = np.eye(4)
-    swap[1, 1], swap[1, 3] = -1, rows[0] + rows[-1]
-    return _displaced(sweep, "upside down", sweep.images, sweep.tracker_from_image @ swap)
-
-
-def backwards(sweep: TrackedSweep) -> TrackedSweep:
-    """The sweep with its pictures in reverse order: each at the pose and phase of another."""
-    return _displaced(sweep, "backwards", sweep.images[::-1], sweep.tracker_from_image)
-
-
-def _displaced(
-    sweep: TrackedSweep, how: str, images: Float32, tracker_from_image: Float
-) -> TrackedSweep:
-    name = f"{sweep.name} {how}"
-    if isinstance(sweep, BloodSweep):
-        return BloodSweep(name, images, tracker_from_image, sweep.sector)
-    return DisplacedSweep(name, images, tracker_from_image)
 
 
 def choose(samples: Samples, frames: Integer) -> Samples:

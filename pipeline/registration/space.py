@@ -8,8 +8,7 @@ wrong place (mirrored, upside down, or in reverse order): their best score is wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,13 +21,9 @@ from pipeline.registration.breathing import follow_breath
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.correction import Correction
-from pipeline.registration.frames import (
-    TrackedSweep,
-    backwards,
-    mirrored,
-    upside_down,
-)
+from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
+from pipeline.registration.misplaced import by_chance
 from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.reading import as_compared
@@ -236,7 +231,7 @@ def find(
     settled = settle_clock(search, best, compared, timing, settings.clock_offset)
     search, best = settled.search, settled.best
     tell(2, _STEPS)
-    chance, misplaced = _by_chance(search, best.pose, compared)
+    chance, misplaced = by_chance(search, best.pose, compared)
     tell(3, _STEPS)
     everything = search.fine_level(compared)
     sizes = [len(sweep.images) for sweep in sweeps]
@@ -275,28 +270,6 @@ def require_frames(
             f"{len(sweeps)} sweeps hold {frames} frames; registration needs {settings.min_frames} "
             "or more (register.min_frames): add sweeps, or write `us: null` in study.yaml"
         )
-
-
-_WRONG_PLACES: Mapping[str, Callable[[TrackedSweep], TrackedSweep]] = {
-    "mirrored from left to right (ImageToProbe, UltrasoundImageOrientation)": mirrored,
-    "turned upside down (ImageToProbe, UltrasoundImageOrientation)": upside_down,
-    "in reverse order (time stamps)": backwards,
-}
-"""How frames are misplaced, and what to look at where they fit better so."""
-
-
-def _by_chance(search: Search, pose: Float, sweeps: Sequence[TrackedSweep]) -> tuple[float, str]:
-    """The best score that frames in the wrong place reach, and which place that is."""
-    # Turned at will, mirrored frames fit a heart seen from behind: they are sought near the result.
-    nearby = replace(search, start=pose) if search.start is None else search
-
-    def reached(displaced: Callable[[TrackedSweep], TrackedSweep]) -> float:
-        return nearby.best([displaced(sweep) for sweep in sweeps]).score
-
-    # At the same time: sums over samples let others run while they count.
-    with ThreadPoolExecutor(2) as pool:
-        scores = pool.map(reached, _WRONG_PLACES.values())
-        return max(zip(scores, _WRONG_PLACES, strict=True))
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:
