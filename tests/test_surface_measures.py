@@ -6,7 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from data_synth.population import draw_heart
 from pipeline.geometry import Float, MovingSurface, Surface
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.measures import (
@@ -14,6 +16,7 @@ from pipeline.surface.measures import (
     ejection_fraction,
     end_systole,
     measures,
+    on_lid,
     segment_names,
 )
 from pipeline.surface.mesh import vertex_areas
@@ -193,6 +196,39 @@ def test_end_systole_is_within_a_quarter_of_the_stroke_volume():
     volume_ml = np.full(20, 100.0)
     volume_ml[6:10] = 60, 69, 71, 79
     assert end_systole(np.arange(20) / 20, volume_ml) == pytest.approx(0.325)
+
+
+@pytest.mark.parametrize("pathology", ["healthy", "hypertrophic_cardiomyopathy", "rv_dilation"])
+def test_septal_segments_lie_between_the_attachments_of_the_right_ventricle(pathology):
+    """As the American Heart Association's model has them, by which muscle lies at the right
+    ventricle half-way up: the two septal segments lie evenly about the middle of that."""
+    heart = draw_heart(np.random.default_rng(6), pathology=pathology)
+    inner, outer, right = (
+        Surface(*heart.surfaces(0.0)[name])
+        for name in ("lv_endocardium", "epicardium", "rv_endocardium")
+    )
+    axis = base_direction(inner, outer)
+    names = segment_names(inner, ~on_lid(inner, axis), axis, right)
+    middle_mm = inner.vertices_mm.mean(axis=0)
+    septal = np.isin(names, ["mid anteroseptal", "mid inferoseptal"])
+    height = inner.vertices_mm[septal] @ axis
+    at_mid = np.abs(outer.vertices_mm @ axis - height.mean()) < np.ptp(height) / 2
+    touching = at_mid & (cKDTree(right.vertices_mm).query(outer.vertices_mm)[0] < 4)
+    across = np.cross(axis, [1.0, 0.3, 0.2])
+    across /= np.linalg.norm(across)
+    beside = np.cross(axis, across)
+
+    def turned_deg(points_mm, about_deg=0.0):
+        off = points_mm - middle_mm
+        angle = np.degrees(np.arctan2(off @ beside, off @ across)) - about_deg
+        return (angle + 180) % 360 - 180
+
+    about = turned_deg(inner.vertices_mm[septal].mean(axis=0))
+    ends = np.percentile(turned_deg(outer.vertices_mm[touching], about), [2, 98])
+    # Half-way between the attachments, which each are known to a few degrees.
+    assert abs(ends.mean()) < 5
+    assert ends[0] < -50
+    assert ends[1] > 50
 
 
 def test_levels_are_thirds_of_the_length():

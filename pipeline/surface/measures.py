@@ -189,8 +189,10 @@ def segment_names(
     """Name ``(n,)`` of the segment of each vertex of the cavity's surface; "" on the lid.
 
     Basal, mid and apical are thirds of the cavity's length along its axis, the apex the lowest
-    tenth. The septum's middle looks at the centre of the right ventricle; seen from the apex the
-    anterior wall follows clockwise, at axis x septum, but in a mirror image.
+    tenth. The septum's middle looks at the centre of the right ventricle beside the middle third,
+    which lies half-way between where that ventricle is attached (its outflow leans over the
+    anterior wall); seen from the apex the anterior wall follows clockwise, at axis x septum, but in
+    a mirror image.
     """
     points = inner.vertices_mm - np.average(
         inner.vertices_mm, axis=0, weights=vertex_areas(inner.vertices_mm, inner.triangles)
@@ -200,7 +202,10 @@ def segment_names(
     share = (height - low) / (high - low)
     level = np.select([share < 1 / 3, share < 2 / 3], ["apical", "mid"], "basal")
     if right is not None:
-        centre = right.vertices_mm.mean(axis=0) - inner.vertices_mm.mean(axis=0)
+        beside = right.vertices_mm - inner.vertices_mm.mean(axis=0)
+        part = (points.mean(axis=0) + beside) @ axis
+        middle = (part > low + (high - low) / 3) & (part < high - (high - low) / 3)
+        centre = beside[middle if middle.any() else slice(None)].mean(axis=0)
         septum = centre - (centre @ axis) * axis
         septum /= np.linalg.norm(septum)
         anterior = np.cross(axis, septum) * (-1 if mirrored else 1)
