@@ -27,15 +27,18 @@ def shown_sector(images: Float32) -> Mask:
     (names, scales, a window's frame), thin lines and a black that is not quite black do not: the
     sector is what ever changes within the convex hull of what does so strongly.
     """
-    known = np.where(np.isfinite(images).all(axis=0), images, 0)
-    change = _change(known)
+    change = _change(images)
     strong = _broad(change > _STRONG * _usual(change))
     return np.asarray(binary_fill_holes(_closed((change > 0) & _hull(strong))), dtype=bool)
 
 
 def _change(images: Float32) -> Float32:
-    """``(h, w)`` brightest less darkest grey value; the brightest where nothing ever changes."""
+    """``(h, w)`` brightest less darkest grey value, the brightest where nothing ever changes; 0
+    where one is no finite number."""
+    # Of a whole sweep no copy is made: it may be most of what memory holds.
     brightest, darkest = images.max(axis=0), images.min(axis=0)
+    known = np.isfinite(brightest) & np.isfinite(darkest)
+    brightest, darkest = np.where(known, brightest, 0), np.where(known, darkest, 0)
     return np.asarray(brightest - darkest if (brightest > darkest).any() else brightest)
 
 
