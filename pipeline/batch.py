@@ -272,8 +272,9 @@ class _Running:
         return outcome_of(*ended, seconds, record, products)
 
     def _not_begun(self, plan: Plan, status: str = INTERRUPTED) -> Ended:
-        """A study that nothing has been done about; its products may well hold."""
-        products, cause = products_of(self._out, plan), "not begun"
+        """A study that nothing is known to be done about; its products may well hold."""
+        products = products_of(self._out, plan)
+        cause = "not begun" if status == INTERRUPTED else "had not ended when this was written"
         if products and any(products.glob(f"*/{STAGE_FILE}")):
             cause += f"; {products} holds products of an earlier run, if of other settings or input"
         shown = (

@@ -114,6 +114,7 @@ def test_a_killed_batch_leaves_a_table_that_says_so_and_its_studies_know(tmp_pat
         "b-watches": "not ended",
         "c": "not ended",
     }
+    assert rows["b-watches"]["cause"] == "had not ended when this was written"
 
 
 def test_ctrl_c_again_ends_a_study_that_does_not_listen(tmp_path: Path) -> None:
