@@ -1,6 +1,6 @@
 """Training of the segmentation network: what it learns from, and that it can be repeated."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -13,18 +13,11 @@ from data_synth.errors import SynthError  # noqa: E402
 from data_synth.population import draw_heart  # noqa: E402
 from data_synth.tissue import COUNTED_AS, TRUTH_LABELS, Tissue  # noqa: E402
 from data_synth.training.__main__ import main  # noqa: E402
+from data_synth.training.batches import Batches, Echo, varied  # noqa: E402
 from data_synth.training.contrast import CLASSES, LABEL_OF, draw_contrast  # noqa: E402
 from data_synth.training.export import write_onnx  # noqa: E402
 from data_synth.training.faults import normalise, spoil  # noqa: E402
-from data_synth.training.loop import (  # noqa: E402
-    Batches,
-    Echo,
-    TrainSettings,
-    draw_from,
-    mean_of,
-    train,
-    varied,
-)
+from data_synth.training.loop import draw_from, mean_of, train  # noqa: E402
 from data_synth.training.network import PLANES, HeartNet, loss, take_over  # noqa: E402
 from data_synth.training.pool import (  # noqa: E402
     PIXEL_MM,
@@ -43,6 +36,7 @@ from data_synth.training.render import (  # noqa: E402
     _draw_positions,
     draw_sample,
 )
+from data_synth.training.runs import TrainSettings, has_ended  # noqa: E402
 from data_synth.training.walls import laid_bare, thin_walled  # noqa: E402
 
 
@@ -320,6 +314,42 @@ def test_training_repeats_to_the_byte_whoever_draws(blocks, tmp_path):
     written = [(tmp_path / str(workers) / "heart.onnx").read_bytes() for workers in values]
     assert written[0] == written[1]
     assert len(written[0]) < 10_000_000
+
+
+@pytest.mark.parametrize("kept", [4, 1000])
+def test_training_that_was_cut_short_goes_on_to_the_same_bytes(blocks, tmp_path, kept):
+    settings = TrainSettings(steps=7, batch=5, fresh=2, kept=kept, seed=1, export_minutes=0.0)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    train(list(blocks), settings, whole)
+
+    def stop(step, value, minutes):
+        # Told a step late: four steps are kept.
+        if step == 4:
+            raise KeyboardInterrupt
+
+    steps = []
+    with pytest.raises(KeyboardInterrupt):
+        train(list(blocks), settings, cut, stop)
+    assert not has_ended(cut / "heart", settings)
+    train(list(blocks), settings, cut, lambda step, *_: steps.append(step))
+    assert steps == [5, 6, 7]
+    assert (cut / "heart.onnx").read_bytes() == (whole / "heart.onnx").read_bytes()
+    # What has ended is not begun again, and is no run of other settings.
+    again = train([], settings, cut, lambda step, *_: steps.append(step))
+    assert steps == [5, 6, 7]
+    assert again.state_dict()["head.weight"].shape[0] == PLANES * CLASSES
+    with pytest.raises(SynthError, match=r"steps 7, now 9.*give another folder"):
+        train(list(blocks), replace(settings, steps=9), cut)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--steps", "0"), ("--minutes", "0"), ("--fresh", "0"), ("--batch", "-1"), ("--seed", "-1")],
+)
+def test_numbers_of_which_there_must_be_more_are_refused(tmp_path, capsys, option, value):
+    with pytest.raises(SystemExit, match="2"):
+        main(["--out", str(tmp_path / "new"), option, value])
+    assert f"{option}: {value}: give" in capsys.readouterr().err
 
 
 def test_training_beats_every_constant_answer(blocks):

@@ -1,4 +1,4 @@
-"""The training loop: draw, learn, average, export."""
+"""The training loop: draw, learn, average, export; and go on where a run was cut short."""
 
 from __future__ import annotations
 
@@ -6,22 +6,20 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
-from torch.nn import functional
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 
+from data_synth.training.batches import Batches, Draw, Echo, Label, Sample, Vary, varied
 from data_synth.training.export import write_onnx
-from data_synth.training.network import WIDTHS, HeartNet, UNet, loss, take_over
+from data_synth.training.network import HeartNet, UNet, loss, take_over
 from data_synth.training.render import ALL_PARTS, Parts, draw_sample
+from data_synth.training.runs import TrainSettings, has_ended, keep, left_of, load_weights
 
-Label = npt.NDArray[np.uint8]
 Report = Callable[[int, float, float], None]
 Net = TypeVar("Net", bound=UNet)
 
@@ -32,133 +30,8 @@ MEAN_BATCHES, MEAN_IMAGES = 40, 32
 """Batches, and images of each, from which a mean network's features are normalised."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainSettings:
-    """How long and how fast to learn; steps or minutes, whichever ends first."""
-
-    steps: int = 100_000
-    minutes: float = math.inf
-    batch: int = 64
-    fresh: int = 8
-    """Images of a batch that are drawn anew; the others are seen again. Drawing takes longer than
-    learning on a graphics processor (Choi et al., "Faster neural network training with data
-    echoing", 2019)."""
-
-    kept: int = 60_000
-    """Images kept to be seen again, the last ones drawn: 147 KB each."""
-
-    learning_rate: float = 2e-3
-    overlap_weight: tuple[float, float] = (1.0, 0.2)
-    """Of the Dice term at the start and at the end: it makes small structures appear early, and
-    would make the network too sure of itself late. A run that goes on from a checkpoint has the
-    second all along."""
-
-    widths: tuple[int, ...] = WIDTHS
-    """Channels of the network of MR."""
-
-    start: Path | None = None
-    """Checkpoint to go on from, of as wide a network or a narrower one; by default weights are
-    drawn at random."""
-
-    parts: Parts = ALL_PARTS
-    """What is drawn at random in the images."""
-
-    seed: int = 0
-    export_minutes: float = 5.0
-    threads: int = 1
-    workers: int = 0
-    """Processes that draw; 0: the one that learns draws, too. Their number changes no image."""
-
-
-Sample = tuple[npt.NDArray[np.float32], Label]
-"""Image ``(channel, row, column)`` and labels, ``(..., row, column)``."""
-
-Draw = Callable[[np.random.Generator], Sample]
 Loss = Callable[[Any, Any, float], Any]
 """Of scores and labels, with the weight of the Dice term."""
-
-Vary = Callable[[Any, Any], tuple[Any, Any]]
-"""Makes other images, and their labels, of a batch that has been seen before."""
-
-
-class Batches(Dataset):  # type: ignore[misc]  # torch is not type-checked
-    """Batches of what ``draw`` gives; the seed, the stream and a batch's number fix it."""
-
-    def __init__(self, draw: Draw, count: int, size: int, seed: int, stream: int) -> None:
-        self.draw, self.count, self.size, self.seeds = draw, count, size, (seed, stream)
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, number: int) -> tuple[Any, Any]:
-        """Images ``(n, channel, row, column)`` float32 and labels uint8, as tensors."""
-        if number >= self.count:
-            raise IndexError(number)
-        rng = np.random.default_rng([*self.seeds, number])
-        images, labels = zip(*(self.draw(rng) for _ in range(self.size)), strict=True)
-        return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(labels))
-
-
-class Echo:
-    """The last images drawn, to be seen again.
-
-    What was drawn at the beginning is replaced first. Images are kept in half precision, which
-    the network's own arithmetic is coarser than.
-    """
-
-    def __init__(self, kept: int, seed: int, vary: Vary | None = None) -> None:
-        self.kept, self.drawn, self.vary = kept, 0, vary
-        self.picks = torch.Generator().manual_seed(seed)
-        self.images: Any = None
-        self.labels: Any = None
-
-    def joined(self, images: Any, labels: Any, size: int) -> tuple[Any, Any]:
-        """A batch of ``size``, those given first, which are kept; those alone at the beginning."""
-        fresh, held = len(images), min(self.drawn, self.kept)
-        if size <= fresh:
-            return images, labels
-        if self.images is None:
-            shape, device = (self.kept,), images.device
-            self.images = torch.empty(shape + images.shape[1:], dtype=torch.float16, device=device)
-            self.labels = torch.empty(shape + labels.shape[1:], dtype=labels.dtype, device=device)
-        # Two sizes in all: the best way to compute is sought anew for each.
-        count = size - fresh if held >= size - fresh else 0
-        again = torch.randint(max(held, 1), (count,), generator=self.picks).to(images.device)
-        seen, of_seen = self.images[again].float(), self.labels[again]
-        if self.vary is not None and count:
-            seen, of_seen = self.vary(seen, of_seen)
-        both, of_both = torch.cat([images, seen]), torch.cat([labels, of_seen])
-        places = (torch.arange(self.drawn, self.drawn + fresh) % self.kept).to(images.device)
-        self.images[places], self.labels[places] = images.half(), labels
-        self.drawn += fresh
-        return both, of_both
-
-
-def varied(images: Any, labels: Any) -> tuple[Any, Any]:
-    """Images ``(n, channel, row, column)`` a little turned, larger and aside, in other greys.
-
-    An image that comes back as it was is learnt by heart, its noise first. One in two keeps its
-    place, as interpolation blurs. Labels ``(n, plane, row, column)`` go with them.
-    """
-    count, device = len(images), images.device
-    normal = torch.randn(6, count, device=device)
-    moved = (torch.rand(count, device=device) < 0.5).float()
-    turn, size = 0.15 * moved * normal[0], torch.exp(0.06 * moved * normal[1])
-    across, down = 0.05 * moved * normal[2], 0.05 * moved * normal[3]
-    cosine, sine = size * turn.cos(), size * turn.sin()
-    affine = torch.stack([cosine, -sine, across, sine, cosine, down], 1).reshape(count, 2, 3)
-    places = functional.affine_grid(affine, list(images.shape), align_corners=False)
-
-    def there(of: Any, mode: str) -> Any:
-        return functional.grid_sample(
-            of, places, mode=mode, padding_mode="reflection", align_corners=False
-        )
-
-    grey = there(images, "bilinear")
-    grey = grey.sign() * grey.abs() ** torch.exp(0.15 * normal[4]).reshape(-1, 1, 1, 1)
-    noise = 0.03 * normal[5].abs().reshape(-1, 1, 1, 1)
-    grey = grey + noise * torch.randn_like(grey)
-    return grey, there(labels.float(), "nearest").to(labels.dtype)
 
 
 class Average:
@@ -166,12 +39,10 @@ class Average:
 
     def __init__(self, network: UNet) -> None:
         self.network = copy.deepcopy(network)
-        self.steps = 0
 
-    def update(self, network: UNet) -> None:
-        """Take in the weights after one more step."""
-        self.steps += 1
-        keep = min(0.997, self.steps / (self.steps + 20))
+    def update(self, network: UNet, steps: int) -> None:
+        """Take in the weights after so many steps."""
+        keep = min(0.997, steps / (steps + 20))
         means, news = (one.state_dict().values() for one in (self.network, network))
         pairs = list(zip(means, news, strict=True))
         with torch.no_grad():
@@ -258,7 +129,9 @@ def learn(
 
     A graphics processor learns where torch finds one. The result depends on what is drawn, the
     seed and the number of steps alone (on one kind of processor; a graphics processor's sums come
-    in no fixed order) when ``minutes`` does not cut it short.
+    in no fixed order) when ``minutes`` does not cut it short. All that it needs to go on is kept
+    beside the network, as ``.run``: a run of the same settings that was stopped goes on from
+    there, to the same result, and one that has ended is not begun again.
 
     Parameters
     ----------
@@ -272,45 +145,112 @@ def learn(
         What is made small.
     vary
         What an image goes through each time it is seen again.
+
+    Raises
+    ------
+    SynthError
+        When ``out`` is of a run of other settings.
     """
+    if has_ended(out, settings):
+        network = make()
+        network.load_state_dict(load_weights(out.with_suffix(".pt")))
+        return network
+    left = left_of(out, settings)
     torch.set_num_threads(settings.threads)
     torch.backends.cudnn.benchmark = True
     fresh = min(settings.fresh, settings.batch)
-    batches = _ahead(Batches(draw, settings.steps, fresh, settings.seed, stream), settings)
+    first = left["step"] if left else 0
+    # What was kept to be seen again is drawn again.
+    again = min(first, -(-settings.kept // fresh)) if fresh < settings.batch else 0
+    numbers = range(first - again, settings.steps)
+    drawn = Batches(draw, settings.steps, fresh, settings.seed, stream)
+    batches = _ahead(Subset(drawn, numbers), settings)
     # After the processes that draw have started, which takes a random number.
     torch.manual_seed(settings.seed)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = make().to(memory_format=torch.channels_last)
-    if settings.start is not None:
-        take_over(network, load_weights(settings.start))
-    network = network.to(device)
-    average, echo = Average(network), Echo(settings.kept, settings.seed, vary)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-3, fused=True)
-    started_s = time.monotonic()
-    exported_s = started_s
+    learner = Learner(make(), settings, loss_of, vary)
+    if left:
+        learner.take_up(left, (first - again) * fresh)
+    started_s = exported_s = time.monotonic()
     waiting: tuple[int, Any, float] | None = None
-    for step, (images, labels) in enumerate(batches):
-        minutes = (time.monotonic() - started_s) / 60
+    for step, (images, labels) in zip(numbers, batches, strict=True):
+        images, labels = (one.to(learner.device, non_blocking=True) for one in (images, labels))
+        if step < first:
+            learner.echo.keep(images, labels)
+            started_s = exported_s = time.monotonic()
+            continue
+        minutes = learner.minutes + (time.monotonic() - started_s) / 60
         done = max(step / settings.steps, minutes / settings.minutes)
         if done >= 1:
             break
-        rate = _rate(done, step) * settings.learning_rate
-        first, final = settings.overlap_weight
-        first = final if settings.start else first
-        weight = first + done * (final - first)
-        images, labels = (one.to(device, non_blocking=True) for one in (images, labels))
-        batch = echo.joined(images, labels, settings.batch)
-        value = _learn(network, optimiser, *batch, rate, weight, loss_of)
-        average.update(network)
+        value = learner.learn(step, done, images, labels)
         # A step late: to wait for a loss is to leave the graphics processor idle meanwhile.
         _report(report, waiting)
         waiting = step + 1, value, minutes
         if time.monotonic() - exported_s > 60 * settings.export_minutes:
             exported_s = time.monotonic()
-            save(out, average.network)
+            save(out, learner.average.network)
+            keep(out, settings, learner.state(step + 1, minutes))
     _report(report, waiting)
-    save(out, average.network)
-    return average.network
+    save(out, learner.average.network)
+    keep(out, settings, None)
+    return learner.average.network
+
+
+class Learner(Generic[Net]):
+    """A network that learns, and all that changes as it does."""
+
+    def __init__(
+        self, network: Net, settings: TrainSettings, loss_of: Loss, vary: Vary | None
+    ) -> None:
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        network = network.to(memory_format=torch.channels_last)
+        if settings.start is not None:
+            take_over(network, load_weights(settings.start))
+        self.network = network.to(self.device)
+        self.average = Average(self.network)
+        self.echo = Echo(settings.kept, settings.seed, vary)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=1.0, weight_decay=1e-3, fused=True
+        )
+        self.settings, self.loss_of = settings, loss_of
+        self.minutes = 0.0
+
+    def state(self, step: int, minutes: float) -> dict[str, Any]:
+        """All of it after so many steps and minutes, but for the images that are kept."""
+        return {
+            "step": step,
+            "minutes": minutes,
+            "network": self.network.state_dict(),
+            "average": self.average.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "picks": self.echo.picks.get_state(),
+            "random": torch.get_rng_state(),
+            "random_there": torch.cuda.get_rng_state_all(),
+        }
+
+    def take_up(self, state: dict[str, Any], drawn: int) -> None:
+        """Be as it was in that state; the images that were kept after ``drawn`` are yet to come."""
+        self.network.load_state_dict(state["network"])
+        self.average.network.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.echo.picks.set_state(state["picks"])
+        self.echo.drawn = drawn
+        self.minutes = state["minutes"]
+        torch.set_rng_state(state["random"])
+        if self.device.type == "cuda" and state["random_there"]:
+            torch.cuda.set_rng_state_all(state["random_there"])
+
+    def learn(self, step: int, done: float, images: Any, labels: Any) -> Any:
+        """Take one step, with a share of the way done; returns the loss."""
+        settings = self.settings
+        rate = _rate(done, step) * settings.learning_rate
+        first, final = settings.overlap_weight
+        first = final if settings.start else first
+        weight = first + done * (final - first)
+        batch = self.echo.joined(images, labels, settings.batch)
+        value = _learn(self.network, self.optimiser, *batch, rate, weight, self.loss_of)
+        self.average.update(self.network, step + 1)
+        return value
 
 
 def _report(report: Report | None, learned: tuple[int, Any, float] | None) -> None:
@@ -320,7 +260,7 @@ def _report(report: Report | None, learned: tuple[int, Any, float] | None) -> No
         report(step, float(value.item()), minutes)
 
 
-def _ahead(batches: Batches, settings: TrainSettings) -> Iterator[tuple[Any, Any]]:
+def _ahead(batches: Dataset, settings: TrainSettings) -> Iterator[tuple[Any, Any]]:
     """All batches in turn, drawn ahead by other processes where there are any."""
     if settings.workers == 0:
         return iter(batches)
@@ -335,12 +275,6 @@ def _ahead(batches: Batches, settings: TrainSettings) -> Iterator[tuple[Any, Any
             prefetch_factor=8,
         )
     )
-
-
-def load_weights(checkpoint: Path) -> dict[str, Any]:
-    """Weights by name, as `save` wrote them."""
-    weights: dict[str, Any] = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    return weights
 
 
 def save(out: Path, network: UNet) -> None:

@@ -12,8 +12,9 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from data_synth.training.loop import Report, TrainSettings, learn
+from data_synth.training.loop import Report, learn
 from data_synth.training.network import UNet
+from data_synth.training.runs import TrainSettings
 from data_synth.training.ultrasound.pictures import (
     BLOOD,
     CLASSES,
