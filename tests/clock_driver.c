@@ -1,4 +1,5 @@
-/* Reads rows of (what, time, flag): what 0 is a beat, 1 a question (flag 2: withheld), 2 takes a beat back. Writes what came back. */
+/* Reads rows of (what, time, flag): what 0 is a beat, 1 a question (flag 2: withheld), 2 takes a beat back,
+ * 3 changes the field to one whose beat lasts as long as the time says. Writes what came back. */
 #include <stdio.h>
 
 #define BEATFIELD_CLOCK_IMPLEMENTATION
@@ -18,6 +19,8 @@ int main(void)
             out[0] = (double)bf_beat(&clock, row[1], row[2] > 0.0);
         } else if (row[0] == 2.0) {
             bf_take_back(&clock);
+        } else if (row[0] == 3.0) {
+            out[0] = bf_change_field(&clock, row[1], 5.0);
         } else {
             bf_tick tick;
             clock.withheld = row[2] > 1.0;

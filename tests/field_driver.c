@@ -223,7 +223,7 @@ int main(int count, char **words)
         failed = refuse(&field) || refuse_tools(&field);
     else if (count > 2 && strcmp(words[2], "poses") == 0) failed = poses(&field);
     else if (count > 2 && strcmp(words[2], "damaged") == 0) failed = damaged(&field);
-    else if (count > 2 && strcmp(words[2], "lock") == 0) failed = bf_lock(&field) == BF_CANNOT_READ;
+    else if (count > 2 && strcmp(words[2], "lock") == 0) failed = bf_lock(&field) == BF_DAMAGED;
     else if (count > 2 && strcmp(words[2], "contains") == 0) failed = contains(&field);
     else failed = ask(&field);
     bf_close(&field);

@@ -145,6 +145,8 @@ def test_a_field_that_is_damaged_gives_zeros_and_says_so(path, tmp_path, way):
         chunk[node] = value
         done = run(program, folder, "damaged", given=question)
         assert (done.returncode, done.stderr) == (0, b"")
+        # Who copies it all before the loop is told then, not by a hole in the middle.
+        assert run(program, folder, "lock").returncode == 100
 
 
 def test_a_pose_that_is_none_is_refused_as_in_python(path, watched):

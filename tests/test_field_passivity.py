@@ -111,6 +111,11 @@ def test_impossible_tanks_are_refused(level, capacity):
         EnergyTank(level, capacity)
 
 
+def test_a_point_or_a_force_that_is_not_three_numbers_is_refused():
+    with pytest.raises(InputError, match="three numbers each"):
+        EnergyTank().passed((0.0, 0.0), (1.0, 0.0, 0.0))
+
+
 def along(tank, way_mm: float, ticks: int):
     """Shares of 1 N that are rendered on a way too short to change the level."""
     start = tank._point_mm[0] if tank._point_mm else 0.0
@@ -130,6 +135,21 @@ def test_a_low_tank_lessens_what_drives_by_its_level_and_what_brakes_not_at_all(
     np.testing.assert_allclose(along(tank, -1e-9, 5), 0.5 + 0.005 * np.arange(1, 6), atol=1e-6)
     np.testing.assert_allclose(along(tank, -1e-9, 200)[-1], 1.0)
     np.testing.assert_array_equal(along(EnergyTank(2.1, 20.0), 1e-9, 30), 1.0)
+
+
+@pytest.mark.parametrize("speed_mm_s", [25, 100, 200, 400])
+@pytest.mark.parametrize("capacity_mj", [5.0, 20.0, 100.0])
+def test_a_force_that_drives_steadily_is_withheld_by_degrees_at_any_speed(speed_mm_s, capacity_mj):
+    """2 N along the motion, until the tank is empty; it must hold what twelve ticks take."""
+    way_mm = speed_mm_s * STEP_S
+    tank = EnergyTank(capacity_mj / 2, capacity_mj)
+    places = way_mm * np.arange(20_000)
+    forces = np.array([tank.passed((x, 0.0, 0.0), (2.0, 0.0, 0.0))[0] for x in places])
+    assert forces[0] == 2
+    assert forces[-1] < 0.02
+    smooth = 12 * 2.0 * way_mm < capacity_mj / 2
+    # A twentieth of the force.
+    assert (np.abs(np.diff(forces)).max() <= 0.1 + 1e-9) or not smooth
 
 
 def test_in_debt_a_tool_at_rest_feels_only_what_brakes():

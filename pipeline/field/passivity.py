@@ -2,10 +2,9 @@
 
 A field at rest gives back what was put into it, where the gradient of its distance has length 1,
 and some millijoules more or less on a closed way about a rim or a medial axis; a beating one can
-push on and on. The tank is
-a passivity observer with a budget: Hannaford and Ryu, IEEE Trans. Robot. Autom. 18(1):1-10, 2002;
-tanks after Franken et al., IEEE Trans. Robot. 27(4):741-756, 2011. Newtons times millimetres are
-millijoules.
+push on and on. The tank is a passivity observer with a budget: Hannaford and Ryu, IEEE Trans.
+Robot. Autom. 18(1):1-10, 2002; tanks after Franken et al., IEEE Trans. Robot. 27(4):741-756, 2011.
+Newtons times millimetres are millijoules.
 """
 
 from __future__ import annotations
@@ -17,8 +16,10 @@ from pipeline.errors import InputError
 
 Triple = tuple[float, float, float]
 
-LOW = 0.1
-"""Below this share of its capacity a tank lessens a force that drives, as its level falls."""
+LOW, LOW_TICKS = 0.1, 12
+"""Below this share of its capacity a tank lessens a force that drives, as its level falls; or below
+the work of so many ticks, of which twenty, each lessened by a twentieth more, take ten and a half.
+"""
 
 WITHHOLD, GIVE_BACK = 0.05, 0.005
 """By how much of the force a tick may withhold more, or less.
@@ -63,7 +64,16 @@ class EnergyTank:
         """The force to render at the tool's present point, of the one that is wanted.
 
         Where one of them is not finite nothing is rendered.
+
+        Raises
+        ------
+        InputError
+            When one of them is not three numbers.
         """
+        if len(point_mm) != 3 or len(force_n) != 3:
+            raise InputError(
+                f"energy tank: point {point_mm} and force {force_n} must be three numbers each"
+            )
         if not math.isfinite(sum(point_mm)):
             self._blind = True
             return 0.0, 0.0, 0.0
@@ -103,7 +113,7 @@ class EnergyTank:
         """
         if ahead_mj < 0 or ahead_mj > 0:
             self._driving = ahead_mj > 0
-        low_mj, goal = LOW * self._capacity_mj, 0.0
+        low_mj, goal = max(LOW * self._capacity_mj, LOW_TICKS * ahead_mj), 0.0
         if self._driving and self.level_mj < low_mj:
             goal = 1.0 - self.level_mj / low_mj if self.level_mj > 0 else 1.0
         self._withheld += min(max(goal - self._withheld, -GIVE_BACK), WITHHOLD)

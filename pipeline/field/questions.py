@@ -31,6 +31,25 @@ def four_floats(
         ) from None
 
 
+def two_floats(phase: float, bound_n: float) -> tuple[float, float]:
+    """The same of the phase and the bound that a tool's force is asked with.
+
+    Raises
+    ------
+    InputError
+        When the phase is not finite, or the bound is not above 0.
+    """
+    try:
+        phase, bound_n = float(phase), float(bound_n)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"phase = {phase!r}, bound_n = {bound_n!r}; give two numbers") from None
+    if not 0 < bound_n < math.inf:
+        raise InputError(f"bound_n = {bound_n:g}; give newtons above 0")
+    if not math.isfinite(phase):
+        raise InputError(f"phase = {phase:g}; give a share of the heartbeat")
+    return phase, bound_n
+
+
 def no_answer(path: Path, x_mm: float, y_mm: float, z_mm: float, phase: float) -> InputError:
     """What to raise when a question's answer is none: the question's fault, or the field's."""
     # The sum, as in the kernels: numbers so large that theirs is infinite are not answered either.
@@ -66,7 +85,11 @@ def require_finite(points: Float, phases: Float | None = None, first: int = 0) -
 
 def as_numbers(values: npt.ArrayLike, name: str) -> Float:
     """An array of float64; raises InputError where there is none."""
+    if np.ma.is_masked(values):
+        raise InputError(f"{name}: some are masked; leave those out")
     try:
+        if (given := np.asarray(values).dtype).kind not in "biufO":
+            raise InputError(f"{name} must be numbers, got {given}")
         return np.ascontiguousarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers ({error})") from None

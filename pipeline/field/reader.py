@@ -6,7 +6,6 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from pipeline.field.fixture import Fixture
 from pipeline.field.metadata import FieldMetadata
 from pipeline.field.potential import offence, potential
 from pipeline.field.questions import (
+    as_numbers,
     as_phases,
     as_points,
     damaged,
@@ -29,6 +29,7 @@ from pipeline.field.questions import (
     no_answer,
     require_answers,
     require_finite,
+    two_floats,
 )
 from pipeline.field.spline import grid_numbers, timeline
 from pipeline.field.threads import in_parts
@@ -250,7 +251,7 @@ class ForceField:
         try:
             name = self._fixtures[self._first].structure if structure is None else structure
             addresses = self._addresses[name]
-        except KeyError:
+        except (KeyError, TypeError):
             raise self._unknown("structure", structure, self._addresses) from None
         where = four_floats(x_mm, y_mm, z_mm, phase)
         found: float = kernel(addresses, self._line, self._numbers, *where)[0]
@@ -272,7 +273,7 @@ class ForceField:
         kernel = self._force_at or self._load()[1]
         try:
             law = self._laws[self._first if fixture is None else fixture]
-        except KeyError:
+        except (KeyError, TypeError):
             raise self._unknown("fixture", fixture, self._laws) from None
         where = four_floats(x_mm, y_mm, z_mm, phase)
         force_n: tuple[float, float, float] = kernel(*law, *where)
@@ -314,13 +315,12 @@ class ForceField:
             than 20 diagonals of the grid, or the field damaged.
         """
         kernel = self._tool_force or self._load_tools()
-        if not (bound_n > 0 and math.isfinite(phase)):
-            raise InputError(f"bound_n = {bound_n} must be above 0, and phase = {phase} finite")
+        phase, bound_n = two_floats(phase, bound_n)
         try:
             law = self._laws[self._first if fixture is None else fixture]
-        except KeyError:
+        except (KeyError, TypeError):
             raise self._unknown("fixture", fixture, self._laws) from None
-        pose = np.ascontiguousarray(mr_from_tool, dtype=np.float64)
+        pose = as_numbers(mr_from_tool, "mr_from_tool")
         try:
             lines, found = tool.lines, np.empty(6)
         except AttributeError:
@@ -331,7 +331,7 @@ class ForceField:
         if pose.shape == (4, 4):
             asked = kernel(
                 law, lines.points_mm, lines.starts, tool.handle_mm, pose,
-                float(phase), float(bound_n), found,
+                phase, bound_n, found,
             )  # fmt: skip
         if asked == -2:
             raise InputError("tool is longer than 20 diagonals of the grid; its unit is mm")

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
-from pipeline.registration import ticks
+from pipeline.registration import intervals, ticks
 
 State = Literal["lost", "regular", "ectopic", "fibrillating"]
 Kind = Literal["normal", "ectopic", "irregular"]
@@ -80,34 +80,25 @@ class PhaseClock:
 
     def __init__(
         self,
-        cycle_rr_s: float,
+        cycle_rr_s: float | None,
         *,
         f_max_n: float = 3.3,
         force_rate_n_per_s: float = 10.0,
         latency_s: float = ticks.LATENCY_S,
     ) -> None:
-        if not ticks.SHORTEST_RR_S <= cycle_rr_s <= ticks.LONGEST_RR_S:
-            raise InputError(
-                f"clock: cycle_rr_s = {cycle_rr_s:g} is no heartbeat; give "
-                f"{ticks.SHORTEST_RR_S:g} to {ticks.LONGEST_RR_S:g} seconds"
-            )
+        cycle_rr_s, fade_per_s = _fit(cycle_rr_s, f_max_n, force_rate_n_per_s)
         if not 0 < latency_s <= _LONGEST_LATENCY_S:
             raise InputError(
                 f"clock: latency_s = {latency_s:g}; give up to {_LONGEST_LATENCY_S:g} seconds"
             )
-        if not (0 < f_max_n < math.inf and 0 < force_rate_n_per_s < math.inf):
-            raise InputError(
-                f"clock: f_max_n = {f_max_n:g}, force_rate_n_per_s = {force_rate_n_per_s:g}; "
-                "both must be positive"
-            )
-        self._state = np.empty(ticks.SIZE)
+        self._state = np.empty(intervals.SIZE)
         # All that a loop calls is compiled here, where a machine has not done so: on what is reset.
-        ticks.reset(self._state, float(cycle_rr_s), force_rate_n_per_s / f_max_n, float(latency_s))
+        ticks.reset(self._state, cycle_rr_s, fade_per_s, float(latency_s))
         ticks.beat(self._state, 0.0, False)
         ticks.take_back(self._state)
         ticks.advance(self._state, 0.0, False, False)
-        ticks.tolerance(self._state)
-        ticks.reset(self._state, float(cycle_rr_s), force_rate_n_per_s / f_max_n, float(latency_s))
+        ticks.change(self._state, cycle_rr_s, fade_per_s)
+        ticks.reset(self._state, cycle_rr_s, fade_per_s, float(latency_s))
 
     def beat(self, r_time_s: float, strange: bool = False) -> Kind | None:
         """Tell the clock of an R peak; what kind of beat it is.
@@ -134,13 +125,31 @@ class PhaseClock:
         """
         ticks.take_back(self._state)
 
+    def change_field(
+        self, cycle_rr_s: float | None, *, f_max_n: float = 3.3, force_rate_n_per_s: float = 10.0
+    ) -> None:
+        """Go on for another field, with all that beats have told.
+
+        Raises
+        ------
+        InputError
+            When something is still rendered of the one before (withhold, until the fade is 0), or a
+            number is none, as for a new clock.
+        """
+        cycle_rr_s, fade_per_s = _fit(cycle_rr_s, f_max_n, force_rate_n_per_s)
+        if ticks.change(self._state, cycle_rr_s, fade_per_s) < 0:
+            raise InputError(
+                f"clock: the field changes at a fade of {self.tick.fade:g}, a step of force; ask "
+                "with withheld until it is 0"
+            )
+
     def at(self, now_s: float, usable: bool = True, *, withheld: bool = False) -> Tick:
         """Phase now.
 
         Where the last beat lies more than 0.02 s ahead of it, beats and questions are timed by
         different clocks: all beats are forgotten, and the rhythm is learnt anew. The fade moves by
-        0.02 s' worth at most, and while it is not 0 the phase by 0.15 s' worth, however long nobody
-        asked, unless a beat was told of that time: a phase that is then too far off is not valid
+        0.02 s' worth at most, and while it is not 0 the phase makes up for no more than that, or
+        three usual turns, however long nobody asked: a phase that is then too far off is not valid
         until it was faded out and set.
 
         Parameters
@@ -158,29 +167,57 @@ class PhaseClock:
         InputError
             When the time is before the last one, not a number, or beyond 1e11 s. If it is so by
             more than 0.02 s, beats are forgotten, the fade falls as in a millisecond, and time goes
-            on from there.
+            on from there: what is to be rendered then, :attr:`tick` says.
         """
         c = self._state
-        before_s = c[ticks.NOW]
+        before_s = c[intervals.NOW]
         if ticks.advance(c, float(now_s), bool(usable), bool(withheld)) < 0:
             raise InputError(f"clock: asked for {now_s} s after {before_s} s; time must rise")
+        return self.tick
+
+    @property
+    def tick(self) -> Tick:
+        """What the clock says as it stands, without a question."""
+        c = self._state
         return Tick(
-            float(c[ticks.PHASE]),
-            float(c[ticks.SD]),
-            STATES[int(c[ticks.STATE])],
-            bool(c[ticks.VALID] > 0),
-            float(c[ticks.FADE]),
+            float(c[intervals.PHASE]),
+            float(c[intervals.SD]),
+            STATES[int(c[intervals.STATE])],
+            bool(c[intervals.VALID] > 0),
+            float(c[intervals.FADE]),
         )
 
     @property
     def next_rr_s(self) -> float:
         """The RR interval that is expected now."""
-        return float(self._state[ticks.RR])
+        return float(self._state[intervals.RR])
 
     @property
     def tolerance_s(self) -> float:
         """How far from the expected time a regular beat may come, before or after."""
-        return float(ticks.tolerance(self._state))
+        return float(intervals.tolerance(self._state))
+
+
+def _fit(
+    cycle_rr_s: float | None, f_max_n: float, force_rate_n_per_s: float
+) -> tuple[float, float]:
+    """Length of the nominal beat, and share of the force that is faded in a second."""
+    if cycle_rr_s is None:
+        raise InputError(
+            "clock: cycle_rr_s is None, as of a field that does not know its beat; give what a "
+            "beat lasts usually"
+        )
+    if not ticks.SHORTEST_RR_S <= cycle_rr_s <= ticks.LONGEST_RR_S:
+        raise InputError(
+            f"clock: cycle_rr_s = {cycle_rr_s:g} is no heartbeat; give "
+            f"{ticks.SHORTEST_RR_S:g} to {ticks.LONGEST_RR_S:g} seconds"
+        )
+    if not (0 < f_max_n < math.inf and 0 < force_rate_n_per_s < math.inf):
+        raise InputError(
+            f"clock: f_max_n = {f_max_n:g}, force_rate_n_per_s = {force_rate_n_per_s:g}; "
+            "both must be positive"
+        )
+    return float(cycle_rr_s), force_rate_n_per_s / f_max_n
 
 
 def systole_s(rr_s: float) -> float:

@@ -12,7 +12,7 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 _DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules", "leads", "qrs")
-_SOURCES = (*_DETECTOR, "ticks")
+_SOURCES = (*_DETECTOR, "intervals", "ticks")
 
 
 def asked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

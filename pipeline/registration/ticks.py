@@ -8,10 +8,43 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from pipeline.geometry import Float
 from pipeline.registration.compiled import asked, inner
+from pipeline.registration.intervals import (
+    BEATS,
+    BEFORE,
+    COUNT,
+    CYCLE_RR,
+    ECTOPIC_BEAT,
+    FADE,
+    FADE_PER_S,
+    FIBRILLATING,
+    GAP,
+    GOOD,
+    IRREGULAR_BEAT,
+    KEPT,
+    LAST_R,
+    LATENCY,
+    LOST,
+    MOST_SHARE,
+    NEEDED,
+    NORMAL_BEAT,
+    NOW,
+    PHASE,
+    REGULAR,
+    RINGS,
+    RR,
+    SD,
+    SIZE,
+    SPREAD,
+    STARTED,
+    STATE,
+    TURN,
+    VALID,
+    interval,
+    judge,
+    tolerance,
+)
 
 R_AFTER_Q_S = 0.04
 SLOWEST_BPM, FASTEST_BPM = 45.0, 120.0
@@ -21,19 +54,11 @@ LATENCY_S = 0.14
 SHORTEST_RR_S, LONGEST_RR_S = 0.2, 3.0
 """Of a heart."""
 R_SD_S = 0.002
-KEPT = 16
-REGULAR_SHARE, MOST_SHARE = 0.10, 0.17
-"""A beat within this share of the predicted interval is regular; a rhythm that is less sure gets
-more room, up to the second."""
 CLOSE = 0.02
 """Largest distance in phase from where the beats say for a phase to be valid."""
 MOST_SD = 0.05
 SLOWEST, QUICKEST = 0.5, 1.5
 """The phase is corrected by running at no less and no more than so many times its own speed."""
-IRREGULAR, ORDERLY = 0.075, 0.05
-"""Step from interval to interval, as a share, which two thirds of the steps exceed where the rhythm
-has no order; and below which it has one again."""
-
 AHEAD_S = 3.0
 """How far a beat may lie beyond the latest time that the clock was told of: no heart waits longer,
 so what lies further ahead was timed by another clock, or in another unit."""
@@ -42,24 +67,13 @@ SLACK_S = 0.02
 time before the one before it; and how much time one step of the fade may make up for."""
 TICK_S = 0.001
 """What is taken to have passed where the time tells nothing: a turn of a haptic loop."""
-HELD_UP_S = 0.1
-"""The phase moves by no more than this makes up for in one answer, unless a beat was told of the
-time between: a loop that was held up for longer, or whose time was set, would render a jump."""
+HELD_UP = 3.0
+"""So many usual turns of the loop, or ``SLACK_S``, are all that the phase makes up for in one
+answer: a loop that was held up for longer, or whose time was set, would render a jump."""
+FOLLOWED = 0.1
+"""Share of the difference by which a turn changes what is a usual one."""
 MOST_TIME_S = 1e11
 """A number beyond is no time in seconds: three thousand years, and too coarse for a phase."""
-
-LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
-NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
-# Places of the state.
-(
-    CYCLE_RR, FADE_PER_S, LATENCY, NOW, STARTED, PHASE, SD, VALID, FADE, STATE, LAST_R, BEATS, RR,
-    SPREAD, GOOD, NEEDED, COUNT, GAP, RINGS,
-) = range(19)  # fmt: skip
-"""Behind it ``KEPT`` intervals, and of each whether it was regular: 1, 0, or -1 for a beat of
-another shape."""
-BEFORE = RINGS + 2 * KEPT
-"""And then all that beats have told, from ``STATE`` on, as it was before the last one."""
-SIZE = 2 * BEFORE - STATE
 
 
 @asked
@@ -113,6 +127,19 @@ def reset(c: Float, cycle_rr_s: float, fade_per_s: float, latency_s: float) -> N
     _forget(c)
 
 
+@asked
+def change(c: Float, cycle_rr_s: float, fade_per_s: float) -> int:
+    """Go on for another field; -1 while anything is rendered of the one before."""
+    if c[FADE] > 0.0:
+        return -1
+    c[CYCLE_RR], c[FADE_PER_S] = cycle_rr_s, fade_per_s
+    # So that the phase is set, not corrected, on the axis of the new cycle.
+    c[VALID] = 0.0
+    if c[BEATS] == 0.0:
+        _forget(c)
+    return 0
+
+
 @inner
 def _forget(c: Float) -> None:
     """Know of no beat, as at the start; the time and what is rendered stay."""
@@ -128,28 +155,6 @@ def _forget(c: Float) -> None:
 @inner
 def _is_time(time_s: float) -> bool:
     return bool(abs(time_s) <= MOST_TIME_S)
-
-
-@asked
-def tolerance(c: Float) -> float:
-    """How far from its predicted time a regular beat may come, seconds."""
-    return float(min(max(REGULAR_SHARE * c[RR], 3.0 * c[SPREAD]), MOST_SHARE * c[RR]))
-
-
-@inner
-def _slot(c: Float, back: int) -> int:
-    return RINGS + int(c[COUNT] - 1.0 - back + KEPT) % KEPT
-
-
-@asked
-def interval(c: Float, back: int) -> float:
-    """The interval ``back`` before the latest (0)."""
-    return float(c[_slot(c, back)])
-
-
-@inner
-def _was_regular(c: Float, back: int) -> bool:
-    return bool(c[_slot(c, back) + KEPT] > 0.0)
 
 
 @asked
@@ -178,7 +183,7 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     c[RINGS + place] = rr_s
     c[RINGS + KEPT + place] = -1.0 if strange else (1.0 if regular else 0.0)
     c[COUNT] += 1.0
-    settled = _judge(c, regular, off_s)
+    settled = judge(c, regular, off_s)
     if c[STATE] == FIBRILLATING:
         return IRREGULAR_BEAT
     # The third beat of a new rate is one of its rhythm.
@@ -199,115 +204,6 @@ def _latest(c: Float) -> float:
     if c[STARTED] > 0.0 and c[BEATS] > 0.0:
         return float(max(c[NOW], c[LAST_R]))
     return float(c[NOW] if c[STARTED] > 0.0 else c[LAST_R])
-
-
-@inner
-def _judge(c: Float, regular: bool, off_s: float) -> bool:
-    """What the rhythm is with its latest interval, and when the next beat is due; whether the last
-    intervals agree (:func:`_settled`)."""
-    steady = _settled(c)
-    if not regular and steady:
-        for back in range(KEPT):
-            c[_slot(c, back) + KEPT] = 1.0 if back < 3 else 0.0
-    if regular and c[COUNT] > 3.0:
-        c[SPREAD] = math.sqrt(0.8 * c[SPREAD] * c[SPREAD] + 0.2 * off_s * off_s)
-    c[GOOD] = c[GOOD] + 1.0 if regular or steady else 0.0
-    share = irregularity(c)
-    if share > IRREGULAR or (c[STATE] == FIBRILLATING and share > ORDERLY):
-        c[STATE], c[NEEDED], c[GOOD] = FIBRILLATING, 3.0, 0.0
-    elif c[GOOD] >= c[NEEDED]:
-        c[STATE], c[NEEDED] = REGULAR, 1.0
-    elif not (regular or steady):
-        c[STATE] = ECTOPIC
-    if c[STATE] != REGULAR:
-        c[VALID] = 0.0
-    _predict(c)
-    return steady
-
-
-@inner
-def _settled(c: Float) -> bool:
-    """Whether the last three intervals agree, so that a new rate has come to stay."""
-    if c[COUNT] < 3.0:
-        return False
-    for back in range(3):
-        if c[_slot(c, back) + KEPT] < 0.0:
-            return False
-    one, two, three = interval(c, 0), interval(c, 1), interval(c, 2)
-    low, high = min(one, min(two, three)), max(one, max(two, three))
-    return high - low <= REGULAR_SHARE * high
-
-
-@asked
-def irregularity(c: Float) -> float:
-    """Step between intervals, as a share of their mean, that two thirds of the last nine exceed.
-
-    Steps to the interval before and to the one before that are both looked at, and the smaller is
-    taken: beats of two kinds in turn have an order. Beats of another shape and the pauses after
-    them do not count.
-    """
-    count = int(min(c[COUNT], 10.0))
-    if count < 7:
-        return 0.0
-    mean = 0.0
-    for back in range(count):
-        mean += interval(c, back) / count
-    return min(_usual_step(c, count, 1), _usual_step(c, count, 2)) / mean
-
-
-@inner
-def _own(c: Float, count: int, back: int) -> bool:
-    """Whether an interval lies between two beats of the usual shape."""
-    before = back + 1 < count and c[_slot(c, back + 1) + KEPT] < 0.0
-    return not (before or c[_slot(c, back) + KEPT] < 0.0)
-
-
-@inner
-def _usual_step(c: Float, count: int, lag: int) -> float:
-    """Size that a third of the steps between intervals ``lag`` apart stay under."""
-    steps = np.empty(10)
-    used = 0
-    for i in range(count - lag):
-        if _own(c, count, i) and _own(c, count, i + lag):
-            steps[used] = abs(interval(c, i) - interval(c, i + lag))
-            used += 1
-    if used < 4:
-        return 0.0
-    return float(np.sort(steps[:used])[(35 * (used - 1)) // 100])
-
-
-@inner
-def _predict(c: Float) -> None:
-    """The next interval: what two before it say, by the latest regular ones (least squares).
-
-    Two are enough for what breathing does, a sine of some beats' period; a small ridge draws the
-    answer to the mean where intervals hardly differ.
-    """
-    count = int(min(c[COUNT], float(KEPT)))
-    mean, used = 0.0, 0.0
-    for back in range(count):
-        if _was_regular(c, back):
-            mean += interval(c, back)
-            used += 1.0
-    if used == 0.0:
-        return
-    mean /= used
-    ridge = 2.0 * (0.01 * mean) * (0.01 * mean)
-    s11, s12, s22, s1y, s2y = ridge, 0.0, ridge, 0.0, 0.0
-    for back in range(count - 2):
-        if _was_regular(c, back) and _was_regular(c, back + 1) and _was_regular(c, back + 2):
-            y, one = interval(c, back) - mean, interval(c, back + 1) - mean
-            two = interval(c, back + 2) - mean
-            s11 += one * one
-            s12 += one * two
-            s22 += two * two
-            s1y += one * y
-            s2y += two * y
-    whole = s11 * s22 - s12 * s12
-    one = interval(c, 0) - mean if _was_regular(c, 0) else 0.0
-    two = interval(c, 1) - mean if count > 1 and _was_regular(c, 1) else 0.0
-    step = ((s1y * s22 - s2y * s12) * one + (s2y * s11 - s1y * s12) * two) / whole
-    c[RR] = mean + min(max(step, -0.2 * mean), 0.2 * mean)
 
 
 @inner
@@ -338,8 +234,7 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
         _lose_time(c, now_s)
         return -1
     passed_s = now_s - c[NOW] if c[STARTED] > 0.0 else 0.0
-    told = c[BEATS] > 0.0 and c[LAST_R] > now_s - passed_s
-    before_s = now_s - (passed_s if told else min(passed_s, HELD_UP_S))
+    before_s = now_s - _followed(c, passed_s)
     c[STARTED], c[NOW] = 1.0, now_s
     if c[BEATS] > 0.0 and c[LAST_R] > now_s + SLACK_S:
         # Left in, it would shift the phase, and make true beats come too late.
@@ -350,6 +245,16 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
     wanted = 0.0 if withheld else c[VALID]
     c[FADE] += min(max(wanted - c[FADE], -reach), reach)
     return 0
+
+
+@inner
+def _followed(c: Float, passed_s: float) -> float:
+    """How much of the time since the last question the phase may make up for."""
+    if c[TURN] == 0.0:
+        c[TURN] = passed_s
+    followed_s = min(passed_s, max(SLACK_S, HELD_UP * c[TURN]))
+    c[TURN] += FOLLOWED * (followed_s - c[TURN])
+    return float(followed_s)
 
 
 @inner

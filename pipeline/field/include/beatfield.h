@@ -110,8 +110,9 @@ bf_status bf_open(bf_field *field, const char *path);
 bf_status bf_verify(const char *path);
 
 /* Copy all values from the files into memory and keep them there: whatever becomes of the files after
- * that changes nothing. Where it fails with BF_CANNOT_LOCK they are copied all the same. Before the
- * first question: it must not run while a thread asks. */
+ * that changes nothing. Where it fails with BF_CANNOT_LOCK they are copied all the same; with
+ * BF_DAMAGED one is not finite, and a hand would feel a hole. Before the first question: it must not
+ * run while a thread asks. */
 bf_status bf_lock(bf_field *field);
 
 /* Give everything back; harmless twice. No thread may be asking any more. */
@@ -184,8 +185,9 @@ double bf_outside_share(const bf_field *field, const bf_tool *tool, const double
  *     bf_tank tank = bf_full_tank(5, 20);               5 mJ to begin with, 20 mJ at most
  *     each tick: bf_force(...); fade, clip to the device's force; bf_pass(&tank, point_mm, force_n);
  *
- * Below a tenth of its capacity a force that drives is lessened by degrees, all of it, as the level falls,
- * and comes back by degrees, so that the hand feels no step: in 1,000 ticks a second within 0.02 s and 0.2 s.
+ * Below a tenth of its capacity, or what twelve ticks would take, a force that drives is lessened by
+ * degrees, all of it, as the level falls, and comes back by degrees, so that the hand feels no step: in 1,000 ticks a second within 0.02 s and 0.2 s
+ * (where the tank holds what twelve ticks take, and the motion is steady).
  * It counts what it passes, so that must be what the hand gets: whatever else is done to the force is
  * done before. Of a tool point_mm is where the hand holds it; what a torque does is not counted.
  */
@@ -1172,17 +1174,32 @@ static bf_status bf__copy(bf_field *field)
 }
 #endif
 
+static int bf__all_finite(const bf_field *field)
+{
+    size_t at, count = field->bytes / sizeof(float);
+    int n, k;
+    for (n = 0; n < field->structures; n++)
+        for (k = 0; k < field->phases; k++) {
+            const float *values = field->structure[n].coefficients[k];
+            /* Neither of what is no number nor of what is infinite is the difference zero. */
+            for (at = 0; at < count; at++)
+                if (!(values[at] - values[at] == 0)) return 0;
+        }
+    return 1;
+}
+
 bf_status bf_lock(bf_field *field)
 {
     bf_status status = BF_OK;
 #ifndef _WIN32
     int n, k;
     if (!field->copied) status = bf__copy(field);
+#endif
+    if (!bf__all_finite(field)) return BF_DAMAGED;
+#ifndef _WIN32
     for (n = 0; status != BF_NO_MEMORY && n < field->structures; n++)
         for (k = 0; k < field->phases; k++)
             if (mlock(field->structure[n].coefficients[k], field->bytes) != 0) status = BF_CANNOT_LOCK;
-#else
-    (void)field; /* opening has copied them */
 #endif
     return status;
 }
@@ -2055,9 +2072,11 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
     return tank;
 }
 
-/* A tank's level below which a force that drives is lessened, over its capacity, and by how much of the
+/* A tank's level below which a force that drives is lessened: over its capacity, and over the work of a
+ * tick, of which twenty, each lessened by a twentieth more, take ten and a half. And by how much of the
  * force a tick may withhold more, or less. */
 #define BF__LOW 0.1
+#define BF__LOW_TICKS 12
 #define BF__WITHHOLD 0.05
 #define BF__GIVE_BACK 0.005
 
@@ -2068,6 +2087,7 @@ static void bf__lessen(bf_tank *tank, double force_n[3], double *ahead)
     double low = BF__LOW * tank->capacity_mj, goal = 0, change;
     int axis;
     if (*ahead > 0 || *ahead < 0) tank->driving = *ahead > 0;
+    if (low < BF__LOW_TICKS * *ahead) low = BF__LOW_TICKS * *ahead;
     if (tank->driving && tank->level_mj < low) goal = tank->level_mj > 0 ? 1 - tank->level_mj / low : 1;
     change = goal - tank->withheld;
     if (change > BF__WITHHOLD) change = BF__WITHHOLD;

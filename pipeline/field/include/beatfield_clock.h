@@ -61,10 +61,11 @@ typedef struct {
 
 typedef struct {
     double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
-    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it, to 1 */
+    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it, to 1 s */
     int withheld;                  /* 0; set it while no force is wanted, as of a tool outside the grid */
     double now_s;
     int started;
+    double turn_s;                 /* a usual turn of the loop */
     double phase, sd;
     int valid;
     double fade;
@@ -82,8 +83,12 @@ typedef struct {
 /* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. With a
  * cycle outside 0.2 to 3 s, or a rate that is not above 0 or not finite, it is never valid and its
  * fade stays 0. Of a monitor that tells beats later than 0.14 s after R, set clock.latency_s: a
- * beat that is overdue is noticed so much later. */
+ * beat that is overdue is noticed so much later (outside of 0 to 1 s: never valid, either). */
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
+
+/* Go on for another field, with all that beats have told: another cycle and rate, as for bf_new_clock.
+ * Set withheld and wait until fade is 0; before, or with numbers that are none, -1, and nothing changes. */
+int bf_change_field(bf_clock *clock, double cycle_rr_s, double fade_per_s);
 
 /* An R peak became known, as a rule within clock.latency_s: the clock waits no longer for one that is
  * due. strange: its shape is unlike the others'. BF_NO_BEAT, and nothing changes, when it is no later
@@ -100,9 +105,9 @@ void bf_take_back(bf_clock *clock);
  * -1 when the time is no number or lies before the last one. Up to 0.02 s before, nothing changes.
  * Otherwise the phase is not valid, beats are forgotten, the fade falls as in a millisecond, and
  * from then on time is counted from there. In one call the fade moves by 0.02 s' worth at most, and
- * while it is not 0 the phase by 0.15 s' worth, however long the loop was held up, unless a beat was
- * told of that time: a phase that is then too far off is not valid until it was faded out and set.
- * More than 1e11 s are no time. */
+ * while it is not 0 the phase makes up for no more than that, or three usual turns of the loop,
+ * however long it was held up: a phase that is then too far off is not valid until it was faded out
+ * and set. More than 1e11 s are no time. */
 int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
 
 /* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. */
@@ -143,7 +148,8 @@ extern "C" {
 #define BFC_AHEAD_S 3.0
 #define BFC_SLACK_S 0.02
 #define BFC_TICK_S 0.001
-#define BFC_HELD_UP_S 0.1
+#define BFC_HELD_UP 3.0
+#define BFC_FOLLOWED 0.1
 #define BFC_MOST_TIME_S 1e11
 
 static double bfc_min(double a, double b) { return b < a ? b : a; }
@@ -191,14 +197,32 @@ static void bfc_forget(bf_clock *c)
     c->before = c->known;
 }
 
+static int bfc_are_fit(double cycle_rr_s, double fade_per_s)
+{
+    return cycle_rr_s >= BFC_SHORTEST_RR_S && cycle_rr_s <= BFC_LONGEST_RR_S && fade_per_s > 0.0 &&
+           isfinite(fade_per_s);
+}
+
+int bf_change_field(bf_clock *c, double cycle_rr_s, double fade_per_s)
+{
+    if (c->fade > 0.0 || !bfc_are_fit(cycle_rr_s, fade_per_s))
+        return -1;
+    c->cycle_rr_s = cycle_rr_s;
+    c->fade_per_s = fade_per_s;
+    /* So that the phase is set, not corrected, on the axis of the new cycle. */
+    c->valid = 0;
+    if (c->known.beats == 0.0)
+        bfc_forget(c);
+    return 0;
+}
+
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s)
 {
     bf_clock clock;
     memset(&clock, 0, sizeof clock);
     clock.known.rhythm = BF_LOST;
     clock.latency_s = BFC_LATENCY_S;
-    if (cycle_rr_s >= BFC_SHORTEST_RR_S && cycle_rr_s <= BFC_LONGEST_RR_S && fade_per_s > 0.0 &&
-        isfinite(fade_per_s)) {
+    if (bfc_are_fit(cycle_rr_s, fade_per_s)) {
         clock.cycle_rr_s = cycle_rr_s;
         clock.fade_per_s = fade_per_s;
     } else {
@@ -416,7 +440,6 @@ static double bfc_place(const bf_clock *c, double now_s, double rr_s)
 static void bfc_watch(bf_clock *c, double now_s, int usable)
 {
     double waited_s = now_s - c->known.last_r_s;
-    double latency_s = c->latency_s > 0.0 && c->latency_s <= 1.0 ? c->latency_s : BFC_LATENCY_S;
     if (!usable || c->known.beats < 1.0 || waited_s > 3.0 * c->known.rr_s) {
         c->known.rhythm = BF_LOST;
         c->known.needed = 3;
@@ -424,7 +447,7 @@ static void bfc_watch(bf_clock *c, double now_s, int usable)
         c->valid = 0;
         if (!usable || waited_s > bfc_max(3.0 * c->known.rr_s, BFC_LONGEST_RR_S))
             c->known.gap = 1;
-    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + latency_s) {
+    } else if (waited_s > c->known.rr_s + bfc_tolerance(c) + c->latency_s) {
         c->known.rhythm = c->known.rhythm == BF_REGULAR ? BF_LOST : c->known.rhythm;
         c->known.good = 0;
         c->valid = 0;
@@ -452,7 +475,19 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
     c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
     near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
     c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed &&
-               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough && c->fade_per_s > 0.0;
+               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough && c->fade_per_s > 0.0 &&
+               c->latency_s > 0.0 && c->latency_s <= 1.0;
+}
+
+/* How much of the time since the last question the phase may make up for. */
+static double bfc_followed(bf_clock *c, double passed_s)
+{
+    double followed_s;
+    if (c->turn_s == 0.0)
+        c->turn_s = passed_s;
+    followed_s = bfc_min(passed_s, bfc_max(BFC_SLACK_S, BFC_HELD_UP * c->turn_s));
+    c->turn_s += BFC_FOLLOWED * (followed_s - c->turn_s);
+    return followed_s;
 }
 
 /* A time that is none, or of another clock: what beats told of is worth nothing any more. */
@@ -477,8 +512,7 @@ int bf_now(bf_clock *c, double now_s, int usable, bf_tick *tick)
     } else {
         double passed_s = c->started ? now_s - c->now_s : 0.0;
         double reach = c->fade_per_s * bfc_min(passed_s, BFC_SLACK_S);
-        int told = c->known.beats > 0.0 && c->known.last_r_s > now_s - passed_s;
-        double before_s = now_s - (told ? passed_s : bfc_min(passed_s, BFC_HELD_UP_S));
+        double before_s = now_s - bfc_followed(c, passed_s);
         c->started = 1;
         c->now_s = now_s;
         /* Left in, it would shift the phase, and make true beats come too late. */
