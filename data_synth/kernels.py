@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -31,7 +33,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     not at those of the functions it calls. So the folder is named by the sources of all.
     """
     usual = config.CACHE_DIR
-    config.CACHE_DIR = str(Path(usual or Path(__file__).parent / "__pycache__") / _digest())
+    config.CACHE_DIR = str(Path(usual or _place()) / _digest())
     try:
         return cast(
             "Callable[Parameters, Result]",
@@ -39,6 +41,20 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
         )
     finally:
         config.CACHE_DIR = usual
+
+
+@cache
+def _place() -> Path:
+    """Where compiled code is kept: beside the sources, else among temporary files of this run."""
+    beside = Path(__file__).parent / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        with tempfile.TemporaryFile(dir=beside):
+            return beside
+    except OSError:
+        folder = tempfile.TemporaryDirectory(prefix="data_synth-")
+        atexit.register(folder.cleanup)
+        return Path(folder.name)
 
 
 @cache

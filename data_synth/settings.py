@@ -103,7 +103,7 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
                 content = yaml.load(stream, _Loader)
         except FileNotFoundError as error:
             raise SynthError(f"{path}: no such file; see configs/phantoms for some") from error
-        except (OSError, yaml.YAMLError) as error:
+        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
             raise SynthError(f"{path}: cannot be read as YAML settings ({error})") from error
     where = str(path) if path is not None else "settings"
     # A file of comments alone asks for nothing.

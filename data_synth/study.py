@@ -129,6 +129,11 @@ def publishing(target: Path) -> Iterator[Path]:
     old = target.with_name(f".{target.name}.old-{os.getpid()}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        # What one of the same number left when it was killed, as in a container.
+        if old.exists() and not target.exists():
+            old.rename(target)
+        for left in (partial, old):
+            shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
         yield partial
         if target.exists():

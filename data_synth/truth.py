@@ -55,11 +55,19 @@ def write_nifti(path: Path, array: Any, mr_from_index: Float, step_s: float = 0.
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Write one mesh as VTK XML PolyData, LPS mm; float32 rounds by 1e-5 mm at most."""
     import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     vertices_mm, triangles = mesh
-    surface = pyvista.PolyData.from_regular_faces(vertices_mm.astype(np.float32), triangles)
-    surface.save(str(path), binary=True)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(
+        pyvista.PolyData.from_regular_faces(vertices_mm.astype(np.float32), triangles)
+    )
+    writer.SetDataModeToBinary()
+    # Into a file of its own the library does not say that a disk is full, and may end the process.
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(writer.GetOutputString())
 
 
 def write_truth(

@@ -8,6 +8,7 @@ of the calibration and of the clock, and the truth about each is kept.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -160,7 +161,11 @@ def write_sweep(path: Path, sweep: Sweep) -> None:
         for key, value in fields.items():
             image.SetMetaData(f"Seq_Frame{number:04d}_{key}", value)
     path.parent.mkdir(parents=True, exist_ok=True)
-    sitk.WriteImage(image, str(path), useCompression=False)
+    try:
+        sitk.WriteImage(image, str(path), useCompression=False)
+    except RuntimeError as error:
+        # The library's own words, for it does not say why.
+        raise OSError(errno.EIO, "the image library failed to write", str(path)) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -189,8 +189,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
             f"{one.patient:24s} {one.patient_id or '-':24s} {one.status:11s} {one.seconds:8.1f} "
             f"{' '.join(figures)}  {one.registration or '-':8s}  {one.cause or one.remarks}"
         )
-    # Names of folders may hold bytes that are no text.
-    # A name of several lines would forge a row.
+    # Names of folders may hold bytes that are no text, and several lines, which would forge a row.
     lines = [in_one_line(line) for line in lines]
     return "\n".join(lines).encode("utf-8", "backslashreplace").decode()
 

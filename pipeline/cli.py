@@ -20,7 +20,7 @@ from cyclopts import App, Parameter
 
 from pipeline import __version__
 from pipeline.caches import provide_place
-from pipeline.console import BatchConsole, Console, show, tell, warning_line
+from pipeline.console import BatchConsole, Console, say, show, tell, warning_line
 from pipeline.ending import guarded
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
@@ -371,12 +371,16 @@ def synth(
     # A process of its own: the pipeline does not know the code that makes its test data.
     with subprocess.Popen([sys.executable, "-m", "data_synth", *arguments]) as child:
         try:
-            return child.wait()
+            code = child.wait()
         except KeyboardInterrupt:
             # It clears away what is half-done, which takes it a moment.
             child.terminate()
             child.wait()
             raise
+    if code < 0:
+        say(f"error: the process that makes studies was ended by signal {-code}")
+        return 128 - code
+    return code
 
 
 @app.command

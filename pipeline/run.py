@@ -10,6 +10,7 @@ import importlib
 import platform
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -145,6 +146,12 @@ def run_study(
         except KeyboardInterrupt as interrupt:
             stages = _record(run, "interrupted")["stages"]
             _warn_of(run, [name for name in stages if stages[name]["status"] == "stale"], interrupt)
+            raise
+        except BaseException:
+            # Of a stage that failed it has been told why; else, as where nobody reads its progress
+            # any more, that the run is over.
+            with suppress(OSError):
+                _record(run, "failed")
             raise
         return _record(run, "done")
 

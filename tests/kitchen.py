@@ -70,10 +70,12 @@ class Kitchen:
     def study(self) -> Study:
         return open_study(self.folder)
 
-    def run(self, settings: Settings | None = None, **keys: Any) -> dict[str, str]:
+    def run(
+        self, settings: Settings | None = None, watcher: Silent | None = None, **keys: Any
+    ) -> dict[str, str]:
         """Run; return which stages did what."""
         self.calls.clear()
-        watcher = Silent()
+        watcher = watcher or Silent()
         runner.run_study(self.study(), settings or Settings(), self.out, watcher, **keys)
         return watcher.outcomes
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +25,7 @@ from pipeline.evaluation.metrics import (
 from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
 from pipeline.products import FrameRow, write_frames
-from pipeline.stages.evaluate import _frame_phase_errors
+from pipeline.stages.evaluate import _frame_phase_errors, _read_truth
 from pipeline.surface.measures import (
     distances_mm,
     ejection_fraction,
@@ -247,6 +248,26 @@ def test_truth_of_sweeps_by_other_names_is_told(tmp_path):
     assert _frame_phase_errors(job, {"us_frames": {"left": one}}) == pytest.approx([0.05])
     with pytest.raises(InputError, match=r"truth\.json: knows no sweep left, only sweep_000; give"):
         _frame_phase_errors(job, {"us_frames": {"sweep_000": one}})
+
+
+@pytest.mark.parametrize(
+    ("change", "registered", "words"),
+    [
+        ({"lv_mass_g": None}, False, "has no lv_mass_g; it needs phases, volumes_ml, lv_mass_g"),
+        ({}, True, "has no mr_from_tracker, us_frames"),
+        ({"volumes_ml": {"lv_endocardium": [1]}}, False, "volumes_ml has no rv_endocardium"),
+    ],
+)
+def test_truth_that_lacks_what_is_compared_is_told(tmp_path, change, registered, words):
+    whole = {"phases": [0], "lv_mass_g": 1}
+    whole["volumes_ml"] = {"lv_endocardium": [1], "rv_endocardium": [1]}
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(whole))
+    assert _read_truth(tmp_path, registered=False) == whole
+    known = {name: value for name, value in (whole | change).items() if value is not None}
+    path.write_text(json.dumps(known))
+    with pytest.raises(InputError, match=f"truth.json: {words}"):
+        _read_truth(tmp_path, registered)
 
 
 def test_target_registration_error_is_counted_where_the_mr_has_the_targets():

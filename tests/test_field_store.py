@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField
+from pipeline.field.files import read_metadata
 from pipeline.field.manifest import canonical_manifest, write_manifest
 from pipeline.field.potential import offence, potential
 from pipeline.field.verify import verify_field
@@ -285,6 +286,21 @@ def test_a_store_without_manifest_is_none(copy, tmp_path):
             read(copy)
         with pytest.raises(InputError, match="no such folder"):
             read(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("mr_from_tracker", np.diag([2.0, 1, 1, 1]).tolist(), "mr_from_tracker: is not a rotation"),
+        ("phases", [0.0, 0.5, 0.99995], "lie 5e-05 of a cycle apart"),
+    ],
+)
+def test_a_description_that_is_none_is_told_with_its_file(copy, key, value, words):
+    description = json.loads((copy / "zarr.json").read_text())
+    description["attributes"]["beatfield"][key] = value
+    (copy / "zarr.json").write_text(json.dumps(description))
+    with pytest.raises(InputError, match=rf"zarr\.json: beatfield.*{words}"):
+        read_metadata(copy)
 
 
 def test_opening_refuses_what_it_can_see_at_no_cost(copy):

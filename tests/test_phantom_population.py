@@ -76,6 +76,17 @@ def test_the_population_is_centred_on_the_published_mean(healthy, name):
     assert np.std(values) > 0.3 * deviation
 
 
+@pytest.mark.parametrize("name", POOLED)
+def test_people_are_drawn_about_the_published_mean(name):
+    mean, deviation = POOLED[name]
+    people = [draw_person(np.random.default_rng([7, seed])) for seed in range(400)]
+    # Three standard errors, and a fifth of a deviation, by which ventricles that must eject alike
+    # give way to one another.
+    assert np.mean([getattr(one, name) for one in people]) == pytest.approx(
+        mean, abs=deviation * (0.2 + 3 / 400**0.5)
+    )
+
+
 def test_right_atrium_lies_between_the_published_ranges(healthy):
     """At most 77 + 2 * 11 ml/m2 (Radiology 191:137-142, 1994: casts and eight subjects).
 

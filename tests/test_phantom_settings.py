@@ -52,6 +52,8 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("false", "keys and values"),
         ("mr: [", "cannot be read as YAML"),
         ("mr: !!map foo", "cannot be read as YAML"),
+        ("seed: 2024-13-01", "cannot be read as YAML"),
+        ("[" * 3000, "cannot be read as YAML"),
     ],
 )
 def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):

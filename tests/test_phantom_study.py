@@ -382,6 +382,70 @@ def test_a_full_disk_is_told_with_the_place(tmp_path):
         raise OSError(28, "No space left on device")
 
 
+WRITE_ON_A_FULL_DISK = """
+import resource, signal, sys
+import numpy as np
+from pathlib import Path
+from types import SimpleNamespace
+from data_synth.errors import SynthError
+from data_synth.study import publishing
+from data_synth.truth import write_mesh
+from data_synth.ultrasound import write_sweep
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+corners = np.random.default_rng(0).normal(size=(30_000, 3))
+mesh = corners, np.arange(30_000).reshape(-1, 3)
+images = np.random.default_rng(0).integers(0, 255, (10, 200, 200)).astype(np.uint8)
+pose = np.tile(np.eye(4), (10, 1, 1))
+sweep = SimpleNamespace(
+    images=images, times_s=np.arange(10.0), image_to_probe=np.eye(4), probe_to_tracker=pose,
+    untracked=np.zeros(10, bool),
+)
+what = {
+    "mesh": lambda folder: write_mesh(folder / "a.vtp", mesh),
+    "sweep": lambda folder: write_sweep(folder / "a.mha", sweep),
+}[sys.argv[1]]
+with publishing(Path(sys.argv[2]) / "whole") as folder:
+    what(folder)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    with publishing(Path(sys.argv[2]) / "p") as folder:
+        what(folder)
+except SynthError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("what", ["mesh", "sweep"])
+def test_what_libraries_write_on_a_full_disk_is_told_too(tmp_path, what):
+    """Here a limit on the size of files; libraries may end the process, or say nothing."""
+    done = subprocess.run(
+        [sys.executable, "-c", WRITE_ON_A_FULL_DISK, what, str(tmp_path)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"{tmp_path / 'p'}: cannot be written" in done.stdout
+    assert [one.name for one in tmp_path.iterdir()] == ["whole"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_what_a_killed_one_of_the_same_number_left_is_in_nobodys_way(tmp_path, there):
+    """As in a container, where every process has the same number."""
+    for left in ("partial", "old"):
+        folder = tmp_path / f".p.{left}-{os.getpid()}"
+        folder.mkdir()
+        (folder / "a").write_text(left)
+    if there:
+        (tmp_path / "p").mkdir()
+    with publishing(tmp_path / "p") as folder:
+        assert not list(folder.iterdir())
+        # Killed between two names, the study that stood there is not lost before the next stands.
+        assert (tmp_path / "p" / "a").exists() is not there
+        (folder / "b").write_text("")
+    assert [one.name for one in tmp_path.iterdir()] == ["p"]
+    assert [one.name for one in (tmp_path / "p").iterdir()] == ["b"]
+
+
 def test_every_setting_and_every_entry_of_the_truth_is_documented(truth):
     page = Path("docs/phantom.md").read_text()
     # `python -m data_synth.settings_table` prints what belongs there.

@@ -300,10 +300,14 @@ def test_an_animation_without_room_for_its_files_fails(
 
 def test_what_cannot_be_shown_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine that cannot draw in 3D, and a wall in which no segment was told."""
-    monkeypatch.setattr(heart, "beating_surfaces", lambda surfaces, rr_s: None)
+    said = SimpleNamespace(returncode=1, stderr=b"Traceback\nNameError: no display\n")
+    monkeypatch.setattr(animation.subprocess, "run", lambda *_, **__: said)
     known = measures(4)
     known["lv_wall_thickness_mm"]["segments"] = {}
     section = heart.movement({}, 0.8, np.arange(4) / 4, known)
+    assert (
+        "not shown beating: this machine cannot draw in 3D (NameError: no display)" in section.text
+    )
     assert [one.caption for one in section.pictures] == [
         "Volumes through the cycle",
         "Left muscle: mass and mean wall thickness",

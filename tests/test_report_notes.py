@@ -151,6 +151,9 @@ def test_a_frame_that_speaks_against_a_registration_is_shown() -> None:
     rows = [FrameRow("a", k, k / 20, 0.1, 0.4 + 0.6 * (k == 30), k < 25) for k in range(31)]
     assert [row.frame for row in _frames_shown(rows)] == [0, 12, 24, 27]
     assert [row.frame for row in _frames_shown(rows[:25])] == [0, 8, 16, 24]
+    # Of few frames each is shown once.
+    assert [row.frame for row in _frames_shown(rows[:3])] == [0, 1, 2]
+    assert _frames_shown([]) == []
 
 
 def test_what_of_the_folder_is_not_used_is_told_in_one_line() -> None:

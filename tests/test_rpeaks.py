@@ -338,7 +338,8 @@ def test_a_rate_told_by_rounded_times_is_no_other(rate_hz):
     for near_hz in (rate_hz * (1 - 1e-6), rate_hz * (1 + 1e-6)):
         found_s = [one.time_s for one in find_beats(ecg.signal_mv, near_hz)]
         same_s = [one.time_s for one in find_beats(ecg.signal_mv, rate_hz)]
-        assert np.allclose(found_s, same_s, atol=1e-3)
+        assert len(found_s) > 8
+        np.testing.assert_allclose(found_s, same_s, atol=1e-3)
 
 
 def test_another_number_of_leads_is_refused():

@@ -198,6 +198,18 @@ def test_a_stage_without_room_for_temporary_files_has_failed(kitchen: Kitchen) -
     assert record["status"] == record["stages"]["b"]["status"] == "failed"
 
 
+def test_a_run_whose_progress_nobody_reads_any_more_is_over(kitchen: Kitchen) -> None:
+    """As `beatfield run ... 2>&1 | head` ends it, between two stages."""
+
+    class Closed(Silent):
+        def ended(self, stage: str, outcome: str, seconds: float) -> None:
+            raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        kitchen.run(watcher=Closed())
+    assert kitchen.record()["status"] == "failed"
+
+
 def test_a_stage_without_memory_failed(kitchen: Kitchen) -> None:
     def fail(job: Job) -> dict[str, Any]:
         raise MemoryError

@@ -281,6 +281,7 @@ def test_cavity_and_background_never_touch():
     volume, height_mm = volume_of(slice_mm, drawn(outside_mm, outside_mm - 4))
 
     cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)
+    assert (volume[height_mm < 45] == CAVITY).any()
     for plane in volume[height_mm < 45]:
         assert not (ndimage.binary_dilation(plane == CAVITY, cross) & (plane == 0)).any()
 

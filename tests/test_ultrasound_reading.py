@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 import zlib
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -70,6 +72,21 @@ def test_compressed_pixels_of_unknown_length_are_refused(tmp_path):
     path = write(tmp_path / "s.mhd", good_fields(), compress=True)
     path.write_bytes(re.sub(rb"CompressedDataSize = \d+\n", b"", path.read_bytes()))
     np.testing.assert_array_equal(read_sweep(path).images, PIXELS)
+
+
+def test_compressed_pixels_are_unpacked_no_further_than_they_are_read(tmp_path):
+    """A file of a hundred kilobytes would become a hundred megabytes, and take as much memory."""
+    path = write(tmp_path / "s.mha", good_fields(), compress=True)
+    header, pixels = path.read_bytes().split(b"ElementDataFile = LOCAL\n")
+    bomb = zlib.compress(zlib.decompress(pixels) + bytes(100_000_000))
+    header = re.sub(rb"(CompressedDataSize = )\d+", rb"\g<1>%d" % len(bomb), header)
+    path.write_bytes(header + b"ElementDataFile = LOCAL\n" + bomb)
+    tracemalloc.start()
+    with suppress(InputError):
+        read_sweep(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 20_000_000
 
 
 def test_calibration_may_stand_once_for_the_file(tmp_path):

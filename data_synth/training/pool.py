@@ -11,7 +11,9 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +26,7 @@ from data_synth.population import draw_heart
 Float = npt.NDArray[np.float64]
 Label = npt.NDArray[np.uint8]
 Progress = Callable[[int, int], None]
+Drawn = TypeVar("Drawn")
 
 PIXEL_MM = 1.5
 PLANES = 48
@@ -146,31 +149,51 @@ def fill_pool(
     SynthError
         When the folder's hearts were drawn with another spread or number of blocks.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    note = folder / "pool.json"
     asked = {"blocks_per_heart": settings.blocks_per_heart, "spread": settings.spread}
-    if note.exists() and (drawn_with := json.loads(note.read_text())) != asked:
-        raise SynthError(f"{folder}: its hearts were drawn with {drawn_with}, not {asked}")
-    note.write_text(json.dumps(asked) + "\n")
     paths = [
         folder / f"seed{settings.seed}_heart{number:04d}.npy" for number in range(settings.hearts)
     ]
-    lacking = [number for number, path in enumerate(paths) if not path.exists()]
-    for number, drawn in zip(lacking, _hearts(lacking, settings, workers), strict=True):
-        part = paths[number].with_suffix(".part")
-        with part.open("wb") as file:
-            np.save(file, drawn)
-        part.rename(paths[number])
-        if progress is not None:
-            progress(number + 1, len(paths))
+    fill(paths, asked, partial(heart_blocks, settings=settings), np.save, progress, workers)
     return paths
 
 
-def _hearts(numbers: Sequence[int], settings: PoolSettings, workers: int) -> Iterator[Label]:
-    """Blocks of each heart in turn."""
-    every = [settings] * len(numbers)
+def fill(
+    paths: Sequence[Path],
+    asked: dict[str, Any],
+    draw: Callable[[int], Drawn],
+    save: Callable[[BinaryIO, Drawn], None],
+    progress: Progress | None,
+    workers: int,
+) -> None:
+    """Draw hearts, by number, whose files are not there, and note what they were asked for.
+
+    Raises
+    ------
+    SynthError
+        When the folder's hearts were asked for otherwise.
+    """
+    if not paths:
+        return
+    folder = paths[0].parent
+    folder.mkdir(parents=True, exist_ok=True)
+    note = folder / "pool.json"
+    if note.exists() and (drawn_with := json.loads(note.read_text())) != asked:
+        raise SynthError(f"{folder}: its hearts were drawn with {drawn_with}, not {asked}")
+    note.write_text(json.dumps(asked) + "\n")
+    lacking = [number for number, path in enumerate(paths) if not path.exists()]
+    for number, drawn in zip(lacking, _each(draw, lacking, workers), strict=True):
+        part = paths[number].with_suffix(".part")
+        with part.open("wb") as file:
+            save(file, drawn)
+        part.rename(paths[number])
+        if progress is not None:
+            progress(number + 1, len(paths))
+
+
+def _each(draw: Callable[[int], Drawn], numbers: Sequence[int], workers: int) -> Iterator[Drawn]:
+    """What is drawn of each heart in turn."""
     if workers <= 1:
-        yield from map(heart_blocks, numbers, every)
+        yield from map(draw, numbers)
     else:
         with ProcessPoolExecutor(workers) as pool:
-            yield from pool.map(heart_blocks, numbers, every)
+            yield from pool.map(draw, numbers)

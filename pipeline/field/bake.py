@@ -72,8 +72,9 @@ def bake_field(
     """Bake distances and potentials of all phases into a new store, and measure it.
 
     Only surfaces that a fixture uses, or that ``settings.structures`` names, are baked. One phase
-    is in memory at a time. A failure leaves a store without manifest, which is none: write into
-    a folder that is renamed when all is done.
+    is in memory at a time; while splines are fitted, all phases of a box about each surface,
+    several times over. A failure leaves a store without manifest, which is none: write into a
+    folder that is renamed when all is done.
 
     Parameters
     ----------

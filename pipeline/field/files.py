@@ -102,6 +102,8 @@ def read_metadata(path: Path) -> FieldMetadata:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(f"{source}: beatfield.{place}: {first['msg']}") from error
+    except InputError as error:
+        raise InputError(f"{source}: beatfield: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{source}: holds no beatfield attributes ({error!r}); give a field.zarr"

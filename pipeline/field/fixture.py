@@ -29,7 +29,7 @@ ROUNDING = 1e-9
 
 
 def steepest_slope(m: int) -> float:
-    """Largest slope of the potential over ``q / delta``, reached where f is most curved.
+    """Largest slope of the potential over ``q / delta``, reached at its point of inflection.
 
     With ``s = (2m - 1) / (2m)`` the slope ``f'(q)`` is largest at ``(q^2 / (2 delta^2))^m = s``
     and is there ``m sqrt(2) s^s exp(-s) / delta``.

@@ -225,7 +225,8 @@ def require_phases(phases: list[float], where: str) -> None:
     inside = all(0 <= phase < 1 for phase in phases)
     if not phases or not inside or any(b <= a for a, b in itertools.pairwise(phases)):
         raise ValueError(f"{where} must rise within [0, 1), got {phases}")
-    step = min((b - a for a, b in itertools.pairwise(phases)), default=1.0)
+    # The first follows the last, a cycle later.
+    step = min(b - a for a, b in itertools.pairwise([*phases, phases[0] + 1]))
     if step < LEAST_PHASE_STEP:
         raise ValueError(
             f"{where} lie {step:.2g} of a cycle apart, at least {LEAST_PHASE_STEP:g} is "

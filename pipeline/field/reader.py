@@ -63,7 +63,8 @@ class ForceField:
 
     The direction of the force is ``g / max(|g|, 0.5)`` for the gradient g: a unit vector except
     near the medial axis, where two parts of the surface are equally near; there the force passes
-    continuously through zero, along an axis of the grid at no more than 8 f_max / spacing.
+    continuously through zero, along an axis of the grid by no more than 8 f_max / spacing plus
+    the law's stiffness.
 
     Questions of many points are shared among the processors; the answers do not depend on how
     many there are. ``force_at`` and ``distance_at`` answer for one point at the least cost.

@@ -17,7 +17,9 @@ POINTS_A_WORKER = 16_384
 
 def processors() -> int:
     """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def in_parts(ask: Callable[[slice, Float], None], phases: Float, count: int) -> None:

@@ -92,7 +92,7 @@ def stack_frames(
     """Sort images, in any order, into one regular stack.
 
     Images that are not of the stack, such as long-axis views, are listed in ``left_out``, a line
-    a series (``pipeline.imaging.frames.choose_stack`` says which those are).
+    a series (``pipeline.imaging.stack_choice.choose_stack`` says which those are).
 
     Parameters
     ----------

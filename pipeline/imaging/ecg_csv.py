@@ -32,7 +32,11 @@ def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
     InputError
         When the table is no such, or its times are uneven or no seconds.
     """
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").strip().splitlines()
+    try:
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    lines = text.strip().splitlines()
     names = [name.strip() for name in lines[0].split(",")] if lines else []
     if len(names) < 2 or names[0] != "time_s":
         raise InputError(

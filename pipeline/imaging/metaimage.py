@@ -97,8 +97,13 @@ def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
     try:
         with path.open("rb") as file:
             file.seek(start)
-            while not unpacking.eof and (part := file.read(_PART_BYTES)):
-                found += len(unpacking.decompress(part))
+            while not unpacking.eof and (
+                part := unpacking.unconsumed_tail or file.read(_PART_BYTES)
+            ):
+                found += len(unpacking.decompress(part, _PART_BYTES))
+                if needed is not None and found > needed:
+                    # No more is read; what packs gigabytes into little is not unpacked to its end.
+                    break
     except zlib.error as error:
         raise InputError(f"{path}: its compressed pixels are damaged ({error}); {_COPY}") from error
     if needed is not None and found < needed:

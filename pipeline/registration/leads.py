@@ -46,6 +46,7 @@ def refuse_knocks(at: int, plan: Plan, s: State) -> None:
         for i in range(at - plan.confirm, at + plan.confirm + 1):
             most = max(most, s.energy[k, i % plan.length])
         if most > KNOCK * usual.level > 0.0:
+            # For this sample alone: a beat of its own follows soon, by the level that is raised.
             lead.bad_until = max(lead.bad_until, s.now[0].seen + 1.0)
             usual.level *= GAIN
 

@@ -35,6 +35,10 @@ from pipeline.registration.uncertainty import curvature_at, rising, sandwich
 
 # A step of one frame beyond this is no drift but an outlier; it is cut to this length.
 _LONGEST_STEP_MM = 1.0
+# A frame that agrees with the model by less than this share of what is usual shows something else.
+_ODD_SHARE = 0.5
+# Share of the difference by which a frame changes what is usual.
+_FOLLOWED = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +141,9 @@ class Follower:
         if samples.frames == 0:
             return self._drift(replace(state, covariance_mm2=waited), used=False)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
-        if not explained > 0.5 * state.usual:
+        if not explained > _ODD_SHARE * state.usual:
             return self._drift(replace(state, covariance_mm2=waited), used=False)
-        usual = state.usual + 0.1 * (explained - state.usual)
+        usual = state.usual + _FOLLOWED * (explained - state.usual)
         step, covariance = self._update(samples, state.mr_from_tracker, waited)
         pose = self.pivot.move(state.mr_from_tracker, step)
         return self._drift(LiveState(pose, covariance, usual), used=True)

@@ -33,11 +33,17 @@ ROOM = 1.06
 """The picture is this much larger than what moves in it."""
 
 
-def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> bytes | None:
-    """Animated WebP of one heartbeat, or None where this machine cannot draw in 3D.
+class NoAnimation(Exception):
+    """Why there is none, as where a machine cannot draw in 3D."""
+
+
+def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> bytes:
+    """Animated WebP of one heartbeat.
 
     Raises
     ------
+    NoAnimation
+        When it cannot be drawn here.
     StageError
         When there is no room for temporary files.
     """
@@ -51,11 +57,13 @@ def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> byte
         try:
             done = subprocess.run(command, capture_output=True, timeout=TIME_LIMIT_S, check=False)
         except subprocess.TimeoutExpired:
-            return None
+            raise NoAnimation(f"to draw it took more than {TIME_LIMIT_S} s") from None
         if done.returncode == NO_ROOM:
             raise _no_room()
         if done.returncode != 0:
-            return None
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            why = said[-1] if said else f"the process that draws ended with {done.returncode}"
+            raise NoAnimation(f"this machine cannot draw in 3D ({why})")
         frames = np.load(work / "frames.npy")
     return _webp(frames, rr_s)
 

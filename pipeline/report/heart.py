@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.geometry import Float, MovingSurface
 from pipeline.report import curves, slices
-from pipeline.report.animation import beating_surfaces, first_frame
+from pipeline.report.animation import NoAnimation, beating_surfaces, first_frame
 from pipeline.report.moments import Moments
 from pipeline.report.page import Picture, Section, Table, picture
 from pipeline.report.style import as_png, as_svg, as_webp
@@ -63,12 +63,16 @@ def movement(
 ) -> Section:
     """The beating surfaces, and the curves of their ``measures.json``.
 
-    There is no animation where the machine cannot draw in 3D, and no map of segments where no
-    segment was found.
+    Where the machine cannot draw in 3D the section says so in the animation's place; there is no
+    map of segments where no segment was found.
     """
     shown: list[Picture] = []
-    animation = beating_surfaces(surfaces, rr_s)
-    if animation is not None:
+    told = "Closed surfaces whose vertices are the same material points in every phase."
+    try:
+        animation = beating_surfaces(surfaces, rr_s)
+    except NoAnimation as reason:
+        told += f" They are not shown beating: {reason}."
+    else:
         caption = (
             "One heartbeat, seen from the front left: left ventricle orange, right ventricle "
             "green, atria yellow (left) and pink, aorta blue"
@@ -79,7 +83,7 @@ def movement(
     shown += _muscle(phases, measures)
     return Section(
         "Surfaces",
-        "Closed surfaces whose vertices are the same material points in every phase.",
+        told,
         shown,
     )
 

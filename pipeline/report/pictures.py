@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -39,13 +40,16 @@ class BloodFound(NamedTuple):
     """``(2,)`` columns and rows of the frame from one of its pixels to the next."""
 
 
+STYLES = ("-", "--", "-.", ":")
+
+
 def fixture_profiles(fixtures: Mapping[str, Fixture]) -> Figure:
     """Force of each fixture against the distance, in newtons."""
     figure = Figure(figsize=(6, 3), layout="constrained")
     axis = figure.subplots()
     reach_mm = 2.5 * max(fixture.resolved_delta_mm for fixture in fixtures.values())
     distance_mm = np.linspace(0, reach_mm, 300)
-    for style, (name, fixture) in zip(("-", "--", "-.", ":") * 9, fixtures.items(), strict=False):
+    for style, (name, fixture) in zip(itertools.cycle(STYLES), fixtures.items(), strict=False):
         value = potential(distance_mm, fixture.resolved_delta_mm, fixture.m)
         axis.plot(distance_mm, fixture.f_max_n * value, style, label=words(name), linewidth=2)
     axis.set(

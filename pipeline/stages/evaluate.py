@@ -39,6 +39,7 @@ REFERENCE = 0
 
 # Points per surface and phase; the mean distance of 4000 stratified samples repeats to 0.02 mm.
 SAMPLES = 4000
+NEEDED_OF_TRUTH = ("phases", "volumes_ml", "lv_mass_g")
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def run(job: Job) -> dict[str, Any]:
     truth = job.study.truth
     if truth is None:
         raise Skipped("no truth in this study")
-    known = _read_truth(truth)
+    known = _read_truth(truth, registered=bool(job.product("register")))
     phases = np.array(read_table(job.products / "ingest" / "phases.json")["phases"])
     true_phases = np.array(known["phases"])
     if phases.shape != true_phases.shape or not np.allclose(phases, true_phases, atol=0.02):
@@ -70,11 +71,21 @@ def run(job: Job) -> dict[str, Any]:
     return _headline(metrics)
 
 
-def _read_truth(truth: Path) -> dict[str, Any]:
+def _read_truth(truth: Path, registered: bool) -> dict[str, Any]:
     try:
-        return read_table(truth / "truth.json")
+        known = read_table(truth / "truth.json")
     except (OSError, ValueError) as error:
         raise InputError(f"{truth}/truth.json: cannot be read ({error})") from error
+    needed = [*NEEDED_OF_TRUTH, *(("mr_from_tracker", "us_frames") if registered else ())]
+    if lacking := [name for name in needed if name not in known]:
+        raise InputError(
+            f"{truth}/truth.json: has no {', '.join(lacking)}; it needs {', '.join(needed)}, as "
+            "docs/phantom.md has them: add them, or take truth/ out"
+        )
+    chambers = ("lv_endocardium", "rv_endocardium")
+    if lacking := [name for name in chambers if name not in known["volumes_ml"]]:
+        raise InputError(f"{truth}/truth.json: volumes_ml has no {', '.join(lacking)}; add them")
+    return known
 
 
 def _structures(

@@ -328,7 +328,7 @@ def _frames_shown(rows: list[FrameRow]) -> list[FrameRow]:
     used = [row for row in rows if row.valid]
     # Of a residual of 1 nothing could be compared: the probe was in air, say.
     against = [row for row in rows if not row.valid and row.residual < 1]
-    count = ULTRASOUND_FRAMES_SHOWN - bool(against)
+    count = min(ULTRASOUND_FRAMES_SHOWN - bool(against), len(used))
     chosen = [used[k] for k in np.linspace(0, len(used) - 1, count).astype(int)]
     return chosen + against[len(against) // 2 :][:1]
 

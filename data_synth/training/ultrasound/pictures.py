@@ -7,11 +7,11 @@ does against speckle are all drawn at random, over wider ranges than scanners ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from data_synth.sector import Sector
 from data_synth.settings import PhantomSettings
 from data_synth.simulate import load_heart
 from data_synth.tissue import Tissue
+from data_synth.training.pool import fill
 from data_synth.window import aim, labels_before, opened, place, rigid
 
 Float = npt.NDArray[np.float64]
@@ -309,30 +310,24 @@ def fill_pool(
     """Write the hearts that the folder lacks, one file each; return all files in order.
 
     Each of ``workers`` processes draws whole hearts; their number changes no byte.
+
+    Raises
+    ------
+    SynthError
+        When the folder's hearts were drawn with another number of frames.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"heart{number:04d}.npz" for number in range(hearts)]
-    lacking = [number for number, path in enumerate(paths) if not path.exists()]
-    for number, pictures in zip(lacking, _hearts(lacking, frames, workers), strict=True):
-        part = paths[number].with_suffix(".part")
-        with part.open("wb") as file:
-            arrays: dict[str, Any] = {}
-            for k, one in enumerate(pictures):
-                arrays |= {f"grey{k:03d}": one.grey, f"label{k:03d}": one.label}
-            np.savez_compressed(file, **arrays)
-        part.rename(paths[number])
-        if progress is not None:
-            progress(number + 1, hearts)
+    fill(
+        paths, {"frames": frames}, partial(heart_pictures, frames=frames), _save, progress, workers
+    )
     return paths
 
 
-def _hearts(numbers: Sequence[int], frames: int, workers: int) -> Iterator[list[Picture]]:
-    every = [frames] * len(numbers)
-    if workers <= 1:
-        yield from map(heart_pictures, numbers, every)
-    else:
-        with ProcessPoolExecutor(workers) as pool:
-            yield from pool.map(heart_pictures, numbers, every)
+def _save(file: BinaryIO, pictures: list[Picture]) -> None:
+    arrays: dict[str, Any] = {}
+    for k, one in enumerate(pictures):
+        arrays |= {f"grey{k:03d}": one.grey, f"label{k:03d}": one.label}
+    np.savez_compressed(file, **arrays)
 
 
 def read_pool(paths: Sequence[Path]) -> list[Picture]:
