@@ -24,6 +24,10 @@ Pathology = Literal[
 ]
 
 
+NO_VALUE = (ValueError, KeyError, IndexError, AttributeError, TypeError)
+"""What the library raises of values that are none, such as 2024-13-01 or !!bool maybe."""
+
+
 class _Loader(yaml.SafeLoader):
     """Refuses a key that is given twice, of which YAML would keep the last and say nothing."""
 
@@ -103,7 +107,7 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
                 content = yaml.load(stream, _Loader)
         except FileNotFoundError as error:
             raise SynthError(f"{path}: no such file; see configs/phantoms for some") from error
-        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
+        except (OSError, yaml.YAMLError, RecursionError, *NO_VALUE) as error:
             raise SynthError(f"{path}: cannot be read as YAML settings ({error})") from error
     where = str(path) if path is not None else "settings"
     # A file of comments alone asks for nothing.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,19 +49,19 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
     if not studies.is_dir():
         raise InputError(f"{studies}: no such folder; give the folder that holds the studies")
     try:
-        direct = set(studies_in(studies))
         beside = sorted(studies.iterdir())
         folders = [path for path in beside if path.is_dir() or _is_dead(path)]
     except OSError as error:
         raise InputError(cannot_be_entered(error)) from error
-    here = out.resolve()
+    direct = {one for one in folders if not one.name.startswith(".") and _is_study(one)}
+    here = _real(out)
     looked_at = [
         one
         for one in folders
-        if one in direct or not (one.name.startswith(".") or one.resolve() == here)
+        if one in direct or not (one.name.startswith(".") or _real(one) == here)
     ]
     plans = [_plan(one, one in direct) for one in looked_at]
-    plans = [one for one in plans if one.is_study or not here.is_relative_to(one.folder.resolve())]
+    plans = [one for one in plans if one.is_study or not here.is_relative_to(_real(one.folder))]
     there = [one for one in plans if not _is_dead(one.folder)]
     if not any(one.is_study for one in there):
         if is_study(studies):
@@ -75,6 +76,19 @@ def plan_batch(studies: Path, out: Path) -> list[Plan]:
         )
     _require_out_elsewhere(studies, out, plans)
     return _without_clashes(plans)
+
+
+def _real(path: Path) -> Path:
+    """The place that a path leads to; of links that lead in a circle, some place."""
+    return Path(os.path.realpath(path))
+
+
+def _is_study(folder: Path) -> bool:
+    """Whether a folder is plainly a study; one that is closed costs itself alone."""
+    try:
+        return is_study(folder)
+    except OSError:
+        return False
 
 
 def _is_dead(path: Path) -> bool:
@@ -102,13 +116,13 @@ def _plan(path: Path, direct: bool) -> Plan:
 
 
 def _require_out_elsewhere(studies: Path, out: Path, plans: Sequence[Plan]) -> None:
-    here = out.resolve()
-    if here == studies.resolve():
+    here = _real(out)
+    if here == _real(studies):
         raise InputError(
             f"{out}: holds the studies, and products would be taken for some; choose another --out"
         )
     for plan in plans:
-        if plan.is_study and here.is_relative_to(plan.folder.resolve()):
+        if plan.is_study and here.is_relative_to(_real(plan.folder)):
             raise InputError(f"{out}: lies inside the study {plan.folder}; choose another --out")
 
 

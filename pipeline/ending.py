@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -15,6 +16,11 @@ from pipeline.console import say, silence, tell, tell_notes
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError
 from pipeline.publish import NO_SPACE
 
+OUT_OF_REACH = (
+    *(errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR),
+    *(errno.EIO, errno.ESTALE),
+)
+"""What is wrong with a name, its rights or the disk behind it, and not with the program."""
 MORE_MEMORY = "use fewer --workers, raise `ulimit -v`, or take a larger machine"
 
 
@@ -30,6 +36,12 @@ def guarded(command: Callable[[], Any]) -> int:
         silence(sys.stdout, sys.stderr)
         return 128 + signal.SIGPIPE
     except OSError as error:
+        if error.filename is not None and error.errno in OUT_OF_REACH:
+            say(
+                f"error: {os.fsdecode(error.filename)}: cannot be reached ({error.strerror}); mend "
+                "its name or its rights, or name another place"
+            )
+            return 2
         # Of a file there would be its name.
         if error.errno not in NO_SPACE or error.filename is not None:
             raise
@@ -41,6 +53,12 @@ def guarded(command: Callable[[], Any]) -> int:
             "error: what is printed, a temporary file or compiled code cannot be written "
             f"({error.strerror}); free some space, also in {places}"
         )
+        return 2
+    except RuntimeError as error:
+        # So the library for paths tells links that lead to one another.
+        if "Symlink loop" not in str(error):
+            raise
+        say(f"error: links lead in a circle ({error}); mend them, or name another place")
         return 2
     except MemoryError as error:
         say(f"error: memory is not enough ({error}); {MORE_MEMORY}")

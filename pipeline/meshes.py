@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Integer, Surface
+from pipeline.ply import require_sound_ply
 
 MESH_ENDINGS = (".vtp", ".stl", ".ply")
 
 # Room for the notes that begin a file.
 _STL_NOTES_BYTES, _NOTES_BYTES = 80, 4096
+_VTP_NUMBER = re.compile(rb'\bNumberOf(\w+)\s*=\s*"([^"]*)"')
+_MOST_COMPONENTS = 64
+# Bytes that one packed byte may become, at most.
+_PACKED = 1032
 
 
 def write_vtp(path: Path, surface: Surface) -> None:
@@ -90,14 +96,15 @@ def _in_lps(vertices_mm: Float, path: Path, mesh: Any) -> Float:
 
 
 def require_whole(path: Path) -> None:
-    """Refuse a file that ends too soon: VTK's readers would crash on it or say pages about it.
+    """Refuse what VTK's readers would crash on, or say pages about: a file that ends too soon, or
+    promises more than it can hold.
 
     Raises
     ------
     InputError
-        When it does, or a PLY file has no header.
+        When it does, a PLY file has no header, or its faces name vertices that are none.
     """
-    checks = {".ply": _require_whole_ply, ".stl": _require_whole_stl, ".vtp": _require_whole_vtp}
+    checks = {".ply": require_sound_ply, ".stl": _require_whole_stl, ".vtp": _require_whole_vtp}
     check = checks.get(path.suffix.lower())
     if check is None:
         return
@@ -110,6 +117,14 @@ def require_whole(path: Path) -> None:
 def _require_whole_vtp(path: Path, content: bytes) -> None:
     if not content.rstrip().endswith(b"</VTKFile>"):
         raise InputError(f"{path}: is no whole VTP file: no </VTKFile> at its end; copy it again")
+    # What is told is made room for before it is read.
+    for name, told in _VTP_NUMBER.findall(content):
+        most = _MOST_COMPONENTS if name == b"Components" else _PACKED * len(content)
+        if not told.isdigit() or len(told) > 12 or int(told) > most:
+            raise InputError(
+                f"{path}: NumberOf{name.decode()} is {told.decode('ascii', 'replace')[:20]}, more "
+                "than such a file can hold; export the surface again"
+            )
 
 
 def _require_whole_stl(path: Path, content: bytes) -> None:
@@ -124,54 +139,3 @@ def _require_whole_stl(path: Path, content: bytes) -> None:
             f"{path}: is no whole STL file: it has {len(content)} bytes, its head promises "
             f"{max(promised, 84)}; copy it again"
         )
-
-
-def _require_whole_ply(path: Path, content: bytes) -> None:
-    try:
-        head, found, body = content.partition(b"end_header")
-        lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-        least = _least_size(lines, any(line[:2] == ["format", "ascii"] for line in lines))
-    except (KeyError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: cannot be read as a PLY file ({error})") from error
-    if not found:
-        raise InputError(f"{path}: is no whole PLY file: its header does not end; copy it again")
-    there = len(body.splitlines()) - 1 if least.in_lines else len(body.lstrip(b"\r")) - 1
-    if there < least.size:
-        unit = "lines" if least.in_lines else "bytes"
-        raise InputError(
-            f"{path}: is cut off: {max(there, 0)} {unit} follow the header, which promises "
-            f"{least.size} or more; copy it again"
-        )
-
-
-class _Least(NamedTuple):
-    """How long the body of a PLY file must be."""
-
-    size: int
-    in_lines: bool
-
-
-def _least_size(lines: list[list[str]], in_lines: bool) -> _Least:
-    """What a PLY header's lines promise: faces have three corners or more."""
-    size = each = count = 0
-    for words in lines:
-        if words[:1] == ["element"]:
-            size += count * each
-            count, each = int(words[2]), 1 if in_lines else 0
-        elif words[:2] == ["property", "list"] and not in_lines:
-            each += _PLY_BYTES[words[2]] + 3 * _PLY_BYTES[words[3]] * words[4].startswith("vertex_")
-        elif words[:1] == ["property"] and not in_lines:
-            each += _PLY_BYTES[words[1]]
-    return _Least(size + count * each, in_lines)
-
-
-_PLY_BYTES = {
-    name: size
-    for size, names in {
-        1: "char uchar int8 uint8",
-        2: "short ushort int16 uint16",
-        4: "int uint float int32 uint32 float32",
-        8: "double float64",
-    }.items()
-    for name in names.split()
-}

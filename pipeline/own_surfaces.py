@@ -29,6 +29,7 @@ from pipeline.geometry import Surface, require_rigid
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.progress import Progress
 from pipeline.publish import only_run_in, publishing, sha256_of
+from pipeline.regular_files import require_no_device
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
 from pipeline.validation import Section, describe_validation
@@ -370,6 +371,7 @@ def _place(folder: Path, path: Path) -> tuple[str, int]:
 
 
 def _timing(path: Path, phase_count: int) -> Timing:
+    require_no_device(path)
     timing = _read_timing(path) if path.exists() else Timing()
     if timing.mr_from_tracker is not None:
         require_rigid(np.array(timing.mr_from_tracker), f"{path}: mr_from_tracker")

@@ -244,8 +244,13 @@ def write_whole(path: Path, text: str) -> None:
     InputError
         When the disk is full or the place cannot be written; what stood there is untouched.
     """
+    # A link stays one, and what is no file, such as /dev/stdout, is written to.
+    path = Path(os.path.realpath(path))
     partial = path.with_name(f".{path.name}{PARTIAL}{os.getpid()}")
     with readable_write_errors(path):
+        if path.exists() and not path.is_file():
+            path.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+            return
         try:
             # File names may hold bytes that are no text.
             partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")

@@ -149,6 +149,11 @@ def open_study(folder: Path) -> Study:
     _require_name_of_description(folder)
     described = folder / "study.yaml"
     require_no_device(described)
+    if described.is_symlink() and not described.exists():
+        raise InputError(
+            f"{described}: is a link to {described.readlink()}, where nothing is; mend it, or take "
+            "it out"
+        )
     given = _read_yaml(described) if described.exists() else {}
     try:
         study = _understood(

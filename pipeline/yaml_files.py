@@ -13,6 +13,10 @@ MOST_NODES = 100_000
 """Keys and values in a file; aliases of aliases grow a few lines beyond all memory."""
 
 
+NO_VALUE = (ValueError, KeyError, IndexError, AttributeError, TypeError)
+"""What the library raises of values that are none, such as 2024-13-01 or !!bool maybe."""
+
+
 class _Loader(yaml.SafeLoader):
     """Refuses a key that is given twice, of which YAML would keep the last and say nothing."""
 
@@ -47,12 +51,11 @@ def read_yaml(path: Path) -> Any:
         raise InputError(
             f"{path}: is nested too deeply, or holds itself; write it out, in a few levels"
         ) from error
-    # Of dates and numbers that are none, such as 2024-13-01, the library raises ValueError.
-    except (yaml.YAMLError, OSError, ValueError) as error:
+    except (yaml.YAMLError, OSError, *NO_VALUE) as error:
         raise InputError(
-            f"{path}: cannot be read as YAML ({error}); text that looks like a date or a number "
+            f"{path}: cannot be read as YAML ({error!r}); text that looks like a date or a number "
             "needs quotes"
-            if isinstance(error, ValueError)
+            if isinstance(error, NO_VALUE)
             else f"{path}: cannot be read as YAML ({error}){_remedy(error)}"
         ) from error
 

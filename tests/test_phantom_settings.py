@@ -53,6 +53,7 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("mr: [", "cannot be read as YAML"),
         ("mr: !!map foo", "cannot be read as YAML"),
         ("seed: 2024-13-01", "cannot be read as YAML"),
+        ("seed: !!int ''", "cannot be read as YAML"),
         ("[" * 3000, "cannot be read as YAML"),
     ],
 )

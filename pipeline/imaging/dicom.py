@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pydicom
-from pydicom.errors import InvalidDicomError
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
@@ -25,6 +24,7 @@ from pipeline.imaging.dicom_pixels import (
 )
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
+from pipeline.imaging.limits import FARTHEST_MM
 from pipeline.imaging.long_axis_series import LongAxis, long_axis_views
 from pipeline.imaging.untimed import spread_evenly
 from pipeline.study_files import files_below
@@ -38,6 +38,10 @@ MR_CLASSES = {
     "1.2.840.10008.5.1.4.1.1.4.1": "Enhanced MR Image Storage",
     "1.2.840.10008.5.1.4.1.1.4.4": "Legacy Converted Enhanced MR Image Storage",
 }
+DEFLATED = b"1.2.840.10008.1.2.1.99"
+_META_BYTES = 2048
+"""So many hold the part of a file that tells how the others are written."""
+
 MOST_FRAMES = 10**6
 """No object holds more."""
 
@@ -90,26 +94,22 @@ def read_dicom_study(
     numbers: set[int | None] = set()
     others = [LeftOut(str(path), "notes", "", "not DICOM", "file") for path in notes]
     for path in images:
-        dataset = _read(path)
-        if _is_directory(dataset):
-            continue
         try:
-            number = _series_number(dataset)
-            unwanted = number in without_series
-            other = "study.yaml leaves it out" if unwanted else _other_object(dataset)
-        except (ValueError, TypeError) as error:
+            number, found = _read_object(path, rr_ms, without_series)
+        except InputError:
+            raise
+        except Exception as error:  # pydicom raises many kinds where a value is asked for
             raise _not_understood(str(path), error) from error
-        numbers.add(number)
-        if other:
-            uid = str(dataset.get("SeriesInstanceUID", ""))
-            noun = "image" if unwanted else "object"
-            others.append(LeftOut(str(path), _series_name(dataset), uid, other, noun))
+        if found is not None:
+            numbers.add(number)
+        if isinstance(found, LeftOut):
+            others.append(found)
         else:
-            frames += _read_frames(dataset, path, rr_ms)
+            frames += found or []
     _require_series(without_series, numbers, str(folder))
     if not frames:
-        found = "; ".join(left_out_lines(others, str(folder)))
-        raise InputError(f"{folder}: holds no MR image: {found}; give the cine's files")
+        told = "; ".join(left_out_lines(others, str(folder)))
+        raise InputError(f"{folder}: holds no MR image: {told}; give the cine's files")
     frames = _with_series_told_apart(frames)
     source, remark = None, ""
     if rr_ms is not None:
@@ -120,6 +120,22 @@ def read_dicom_study(
         stack = replace(stack, remarks=(remark, *stack.remarks))
     views, no_views = long_axis_views(frames, stack.cine)
     return replace(stack, left_out=(*stack.left_out, *no_views)), views
+
+
+def _read_object(
+    path: Path, rr_ms: float | None, without_series: Sequence[int]
+) -> tuple[int | None, list[Frame] | LeftOut | None]:
+    """Number of a file's series and its frames, or why none is used; None of a directory."""
+    dataset = _read(path)
+    if _is_directory(dataset):
+        return None, None
+    number = _series_number(dataset)
+    unwanted = number in without_series
+    other = "study.yaml leaves it out" if unwanted else _other_object(dataset)
+    if not other:
+        return number, _read_frames(dataset, path, rr_ms)
+    uid, noun = str(dataset.get("SeriesInstanceUID", "")), "image" if unwanted else "object"
+    return number, LeftOut(str(path), _series_name(dataset), uid, other, noun)
 
 
 def _with_series_told_apart(frames: Sequence[Frame]) -> list[Frame]:
@@ -143,6 +159,13 @@ def _require_series(asked: Sequence[int], there: set[int | None], where: str) ->
 
 
 def _read(path: Path) -> Any:
+    with path.open("rb") as file:
+        # Of a megabyte that unpacks to gigabytes the library makes gigabytes.
+        if DEFLATED in file.read(_META_BYTES):
+            raise InputError(
+                f"{path}: is deflated as a whole (transfer syntax {DEFLATED.decode()}); export it "
+                "uncompressed, or with its pixels alone compressed"
+            )
     try:
         dataset = pydicom.dcmread(path, force=is_bare(path))
         if "TransferSyntaxUID" not in dataset.file_meta:
@@ -153,7 +176,8 @@ def _read(path: Path) -> Any:
                 else pydicom.uid.ExplicitVRLittleEndian
             )
         return dataset
-    except (InvalidDicomError, OSError, EOFError, ValueError, KeyError) as error:
+    # What the library raises of damaged files is of many kinds.
+    except Exception as error:
         raise InputError(
             f"{path}: is not DICOM, or damaged; copy it again from the scanner, or take it out of "
             f"the folder where it does not belong there ({str(error).partition('. Use ')[0]})"
@@ -290,7 +314,7 @@ def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[
     along_row, along_column = (float(value) for value in np.array(spacing, float).reshape(2)[::-1])
     if not np.allclose(directions @ directions.T, np.eye(2), atol=5e-3):
         raise ValueError(f"ImageOrientationPatient {directions.ravel().tolist()}")
-    if not (np.isfinite(position_mm).all() and 0 < min(along_row, along_column) < np.inf):
+    if not (np.abs(position_mm).max() <= FARTHEST_MM and 0 < min(along_row, along_column) < np.inf):
         raise ValueError(f"position {position_mm.tolist()} and PixelSpacing {list(spacing)}")
     # Of directions written with few decimals, the nearest that are of length 1 and at right angles.
     left, _, right = np.linalg.svd(directions, full_matrices=False)

@@ -49,6 +49,9 @@ def _read_by_gdcm(dataset: Any, path: Path) -> Any:
     syntax = _syntax(dataset)
     if enhanced or not plain or not syntax.is_transfer_syntax or not syntax.is_compressed:
         return None
+    if syntax == pydicom.uid.RLELossless:
+        # Of damaged ones it makes black images, and says nothing; others are read without it.
+        return None
     import SimpleITK as sitk
 
     reader = sitk.ImageFileReader()

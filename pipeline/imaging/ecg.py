@@ -25,6 +25,10 @@ MICRO_UNIT = re.compile(rb"^[^#\s]\S*\s+\S+\s+\S*/\S*?(?:\xb5|\xce\xbc)", re.MUL
 another byte stands before it) or the Greek letter."""
 
 
+MOST_SIGNALS = 64
+"""Of a record whose segments describe them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ecg:
     """A recording of one or more leads, evenly sampled."""
@@ -104,6 +108,7 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
     if not header.is_file():
         raise InputError(f"{header}: no such file; a WFDB record needs its .hea and .dat files")
     try:
+        _require_few_signals(header)
         _require_plain_units(header)
         with _quiet_wfdb() as wfdb:
             _require_one_way_of_writing(wfdb, header)
@@ -117,6 +122,20 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
             "every .dat file it names, of the length it gives; copy the record again"
         ) from error
     return _wfdb_leads(record, header, gaps)
+
+
+def _require_few_signals(header: Path) -> None:
+    """Refuse a header whose first line promises more signals than there are lines for: the library
+    makes room for all of them first."""
+    lines = [line for line in header.read_bytes().splitlines() if line and line[:1] != b"#"]
+    words = lines[0].split() if lines else []
+    told = words[1].decode("ascii", "replace") if len(words) > 1 else ""
+    # The segments of a record in parts have the same signals, and lines of their own.
+    if told.isdecimal() and int(told[:9]) > max(len(lines) - 1, MOST_SIGNALS):
+        raise InputError(
+            f"{header}: promises {told[:9]} signals, and has {len(lines) - 1} lines that describe "
+            "some; copy the record again"
+        )
 
 
 def _require_plain_units(header: Path) -> None:

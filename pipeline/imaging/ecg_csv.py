@@ -22,6 +22,7 @@ LEAD = re.compile(r"I{1,3}|aV[RLF]|V\d?R?|MCL?\d?|ML ?I{1,3}|[XYZ]|", re.IGNOREC
 _RATES_HZ = (100.0, 2000.0)
 # Steps by which times of samples that were taken in order may stray from an even grid.
 _JITTER_STEPS = 5.0
+MOST_COLUMNS = 256
 
 
 def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
@@ -42,6 +43,11 @@ def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
         raise InputError(
             f"{path}: the first row is {names}; it needs time_s and then the name of each lead, "
             f"separated by commas{_remedy(lines[0] if lines else '')}"
+        )
+    if len(names) > MOST_COLUMNS:
+        raise InputError(
+            f"{path}: has {len(names)} columns, at most {MOST_COLUMNS} are read; leave those that "
+            "are no leads out"
         )
     for name in names[1:]:
         _require_millivolts(name, path)

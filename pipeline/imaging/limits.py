@@ -10,6 +10,9 @@ MOST_VALUES = 1 << 30
 MOST_PIXELS = 1 << 24
 """Of one image of a slice: 4096 x 4096."""
 
+FARTHEST_MM = 1e5
+"""From the scanner's origin: no bore is as long."""
+
 
 def require_bounded(values: int, where: str, most: int = MOST_VALUES) -> None:
     """Refuse a file before its pixels are unpacked, which a few kilobytes can make gigabytes.

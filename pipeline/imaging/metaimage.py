@@ -21,6 +21,10 @@ _VALUE_BYTES = {
 _HEADER_LINE = re.compile(r"\s*(\w+)\s*[=:](.*)")
 _HEADER_ENDS = "ElementDataFile"
 _SEVERAL_FILES = re.compile(r"%|^LIST\b|\s\d+\s+\d+")
+# A file a frame, numbered from, to and by: the library hands the name to C's printf.
+_NUMBERED = re.compile(r"[^%]*%0?\d{0,3}d[^%]*(\s+\d{1,6}){2,3}")
+# Of digits.
+_LONGEST_NUMBER = 12
 # A file of another kind may have no lines at all.
 _LONGEST_LINE = 65536
 _PART_BYTES = 1 << 20
@@ -51,7 +55,10 @@ def read_metaimage(path: Path) -> tuple[Any, Fields]:
         raise InputError(
             f"{path}: cannot be read as a MetaImage sequence ({_gist(error)}); {_COPY}"
         ) from error
-    fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
+    try:
+        fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
+    except (TypeError, UnicodeError) as error:
+        raise InputError(f"{path}: a name in its header is no text ({error}); {_COPY}") from error
     return _grey_frames(path, image, sitk.GetArrayFromImage(image)), fields
 
 
@@ -61,12 +68,27 @@ def _require_all_bytes(path: Path) -> None:
     The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
     """
     header, start = _header_of(path)
-    values, each = _values(header), _VALUE_BYTES.get(header.get("ElementType", ""))
+    values, kind = _values(header), header.get("ElementType", "")
     if values is None:
         raise InputError(f"{path}: its header tells no DimSize in whole numbers; {_COPY}")
     require_bounded(values, str(path))
-    whole = values * each if each else None
+    if kind not in _VALUE_BYTES:
+        raise InputError(
+            f"{path}: ElementType is {kind or 'missing'}; it needs one of {', '.join(_VALUE_BYTES)}"
+        )
+    axes = len(header["DimSize"].split())
+    if header.get("NDims", "") != str(axes) or not 2 <= axes <= 4:
+        raise InputError(
+            f"{path}: NDims is {header.get('NDims', 'missing')} and DimSize has {axes} numbers; a "
+            f"sequence has three of both; {_COPY}"
+        )
+    whole = values * _VALUE_BYTES[kind]
     where = header.get(_HEADER_ENDS, "")
+    if "%" in where and not _NUMBERED.fullmatch(where):
+        raise InputError(
+            f"{path}: {_HEADER_ENDS} = {where} names no files; it needs LOCAL, the name of one, or "
+            "a pattern such as image%03d.raw 0 9 1"
+        )
     if _SEVERAL_FILES.search(where):
         return
     pixels = path if where.upper() == "LOCAL" else path.parent / where
@@ -90,8 +112,8 @@ def _require_all_bytes(path: Path) -> None:
         _require_unpacked(pixels, start if pixels == path else 0, whole)
 
 
-def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
-    """Refuse compressed pixels that are damaged."""
+def _require_unpacked(path: Path, start: int, needed: int) -> None:
+    """Refuse compressed pixels that are damaged, or more than the header says."""
     # Of zlib or gzip, whichever it says.
     unpacking, found = zlib.decompressobj(32 + zlib.MAX_WBITS), 0
     try:
@@ -101,12 +123,15 @@ def _require_unpacked(path: Path, start: int, needed: int | None) -> None:
                 part := unpacking.unconsumed_tail or file.read(_PART_BYTES)
             ):
                 found += len(unpacking.decompress(part, _PART_BYTES))
-                if needed is not None and found > needed:
-                    # No more is read; what packs gigabytes into little is not unpacked to its end.
-                    break
+                if found > needed:
+                    # Gigabytes may be packed into little: not unpacked any further.
+                    raise InputError(
+                        f"{path}: its compressed pixels are more than the {needed} bytes that its "
+                        f"header says; {_COPY}"
+                    )
     except zlib.error as error:
         raise InputError(f"{path}: its compressed pixels are damaged ({error}); {_COPY}") from error
-    if needed is not None and found < needed:
+    if found < needed:
         raise InputError(
             f"{path}: its pixels need {needed} bytes, {found} of them can be unpacked; {_COPY}"
         )
@@ -142,7 +167,7 @@ def _values(header: Fields) -> int | None:
 
 
 def _number(word: str | None) -> int | None:
-    return int(word) if word and word.isdecimal() else None
+    return int(word) if word and word.isdecimal() and len(word) <= _LONGEST_NUMBER else None
 
 
 def _gist(error: RuntimeError) -> str:

@@ -22,7 +22,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
-from pipeline.imaging.limits import require_bounded
+from pipeline.imaging.limits import FARTHEST_MM, require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti_doubts import (
     doubts_of_place,
@@ -39,6 +39,9 @@ _told_mends.setLevel(logging.CRITICAL)
 LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 SECONDS_PER_UNIT = {"sec": 1.0, "msec": 1e-3, "usec": 1e-6}
+
+UNREADABLE = (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, OverflowError)
+"""What the library raises of files that are damaged, or none of its own."""
 
 VOXEL_MM = (0.1, 50.0)
 """Edges of a cine's voxels; outside is a unit mistaken."""
@@ -233,7 +236,7 @@ def _load(path: Path) -> Any:
         image.get_qform(coded=True)
         with ImageOpener(path) as stream:
             as_stored = type(image.header).from_fileobj(stream, check=False)
-    except (ImageFileError, HeaderDataError, OSError, EOFError, ValueError, zlib.error) as error:
+    except (*UNREADABLE, zlib.error) as error:
         raise InputError(
             f"{path}: cannot be read as NIfTI ({error}); copy or convert it again"
         ) from error
@@ -266,10 +269,10 @@ def _other_placement(image: Any) -> str:
 def _right_angled_affine(image: Any, path: Path) -> Float:
     affine: Float = np.asarray(image.affine, dtype=float)
     lengths = np.linalg.norm(affine[:3, :3], axis=0)
-    if not np.isfinite(affine).all() or not (lengths > 0).all():
+    if not (np.abs(affine) <= FARTHEST_MM).all() or not (lengths > 0).all():
         raise InputError(
             f"{path}: its {_placement_name(image)} gives a voxel no size, or holds what is no "
-            f"number: {np.round(affine[:3], 3).tolist()}; {_other_placement(image)}"
+            f"number of millimetres: {np.round(affine[:3], 3).tolist()}; {_other_placement(image)}"
         )
     axes = affine[:3, :3] / lengths
     if np.linalg.matrix_rank(axes, tol=1e-3) < 3:
@@ -305,14 +308,21 @@ def _timing(
     return triggers, np.full(slices, rr_ms), source
 
 
+def _unit_of_time(image: Any) -> str:
+    try:
+        return str(image.header.get_xyzt_units()[1])
+    except KeyError:
+        return "unknown"
+
+
 def _step_ms(image: Any) -> float:
-    unit = image.header.get_xyzt_units()[1]
+    unit = _unit_of_time(image)
     return 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
 
 
 def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
     """One heartbeat of evenly spread phases, as the header's time step tells it."""
-    unit = image.header.get_xyzt_units()[1]
+    unit = _unit_of_time(image)
     step = float(image.header.get_zooms()[3])
     step_ms = _step_ms(image)
     if not step_ms > 0:
