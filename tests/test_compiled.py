@@ -20,7 +20,7 @@ from pipeline.registration import compiled as clock
     ("door", "marks"),
     [
         (phantom, ("compiled",)),
-        (clock, ("asked", "inner")),
+        (clock, ("asked", "inner", "within")),
         (field, ("asked", "inner")),
         (dissection, ("asked", "inner")),
     ],

@@ -88,6 +88,11 @@ def test_a_lead_that_falls_off_fades_the_force_out_at_the_bounded_rate(tmp_path,
     assert np.abs(np.diff(rows[:, 3])).max() * GUIDE.f_max_n < 0.01 + 2e-6
 
 
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    return build(EXAMPLES / "server.c", tmp_path_factory.mktemp("c") / "server", "-std=c99")
+
+
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_c_server_is_cpp_too(tmp_path):
     build(EXAMPLES / "server.c", tmp_path / "server", "-std=c++11", compiler="g++")
@@ -95,13 +100,12 @@ def test_c_server_is_cpp_too(tmp_path):
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 @pytest.mark.parametrize("settings", [{}, {"atrial_probability": 0.1}])
-def test_c_server_renders_the_same_forces(tmp_path, path, capsys, settings):
+def test_c_server_renders_the_same_forces(tmp_path, path, program, capsys, settings):
     """In a regular heart, and where beats come early that look like the others."""
     record, _ = recorded(tmp_path, **settings)
     peaks = tmp_path / "peaks.csv"
     assert main(["rpeaks", str(record), "--out", str(peaks)]) == 0
     words = [str(word) for word in (path, peaks, *TIP_MM)]
-    program = build(EXAMPLES / "server.c", tmp_path / "server", "-std=c99")
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
     field, table_of_peaks, *point = words
     for given, told in (
@@ -147,9 +151,8 @@ GOOD_ROW = "1.20000,normal,0,II,0.80000,0.999,1.33200,0\n"
         "2.0,normal,1," + "I" * 300 + ",0.8,0.999,2.13,0",
     ],
 )
-def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, row):
+def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, program, row):
     head = "time_s,kind,valid,lead,rr_s,likeness,known_s,strange\n"
-    program = build(EXAMPLES / "server.c", tmp_path / "server", "-std=c99")
     words = [str(program), str(path), str(tmp_path / "peaks.csv"), *map(str, TIP_MM)]
     (tmp_path / "peaks.csv").write_text(f"{head}{GOOD_ROW}{row}\n{GOOD_ROW}")
     done = subprocess.run(words, capture_output=True, text=True, check=False)

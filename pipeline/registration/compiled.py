@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 from pipeline.compiled import door
 
@@ -25,9 +25,13 @@ def inner(function: Callable[Parameters, Result]) -> Callable[Parameters, Result
     return _compile(function, no_cpython_wrapper=True)
 
 
-def _compile(
-    function: Callable[Parameters, Result], no_cpython_wrapper: bool
-) -> Callable[Parameters, Result]:
-    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True}
-    made = door(Path(__file__).parent, _SOURCES, **options, no_cpython_wrapper=no_cpython_wrapper)
+def within(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile as a part of what calls it, once: each level of calls that a large function lies
+    below is optimised with all that it calls, and again with those above."""
+    return _compile(function, no_cpython_wrapper=True, inline="always")
+
+
+def _compile(function: Callable[Parameters, Result], **given: Any) -> Callable[Parameters, Result]:
+    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, **given}
+    made = door(Path(__file__).parent, _SOURCES, **options)
     return cast("Callable[Parameters, Result]", made(function))

@@ -34,6 +34,13 @@ BEFORE = RINGS + 2 * KEPT
 SIZE = 2 * BEFORE - STATE
 
 
+@inner
+def remember(c: Float) -> None:
+    """Keep what beats have told, to be taken back."""
+    for i in range(BEFORE - STATE):
+        c[BEFORE + i] = c[STATE + i]
+
+
 @asked
 def tolerance(c: Float) -> float:
     """How far from its predicted time a regular beat may come, seconds."""
@@ -125,11 +132,16 @@ def _usual_step(c: Float, count: int, lag: int) -> float:
     used = 0
     for i in range(count - lag):
         if _own(c, count, i) and _own(c, count, i + lag):
-            steps[used] = abs(interval(c, i) - interval(c, i + lag))
+            # Sorted as they come: the library's own sort takes seconds to compile.
+            step, place = abs(interval(c, i) - interval(c, i + lag)), used
+            while place > 0 and steps[place - 1] > step:
+                steps[place] = steps[place - 1]
+                place -= 1
+            steps[place] = step
             used += 1
     if used < 4:
         return 0.0
-    return float(np.sort(steps[:used])[(35 * (used - 1)) // 100])
+    return float(steps[(35 * (used - 1)) // 100])
 
 
 @inner

@@ -27,7 +27,7 @@ With every sample, in this order:
 from __future__ import annotations
 
 from pipeline.geometry import Float
-from pipeline.registration.compiled import asked, inner
+from pipeline.registration.compiled import asked, inner, within
 from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
 from pipeline.registration.envelope import store
 from pipeline.registration.leads import SILENT_EVERY_S, fuse, refuse_knocks, refuse_silent
@@ -130,7 +130,7 @@ def _learn(middle: int, plan: Plan, s: State) -> int:
     return first
 
 
-@inner
+@within
 def _decide(i: int, plan: Plan, s: State) -> None:
     """Look at the energy at sample ``i``: has a wave passed, is a beat overdue?"""
     now, rhythm, rate_hz = s.now[0], s.now[0].rhythm, plan.rate_hz
@@ -159,7 +159,7 @@ def _decide(i: int, plan: Plan, s: State) -> None:
         _learn_again(first, last, i - rhythm.last_at > MOST_S * rate_hz, plan, s)
 
 
-@inner
+@within
 def _judge(at: int, plan: Plan, s: State) -> bool:
     """Whether the wave at a sample is a beat."""
     now, rhythm = s.now[0], s.now[0].rhythm
@@ -216,7 +216,7 @@ def _keep(at: int, height: float, s: State) -> None:
     now.waiting += 1
 
 
-@inner
+@within
 def _look_back(i: int, plan: Plan, s: State) -> int:
     """A beat is overdue: the sample of the highest wave since the last one, if that may be it; -1
     if not."""
@@ -265,7 +265,7 @@ def _highest_kept(i: int, plan: Plan, s: State) -> int:
     return best
 
 
-@inner
+@within
 def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> None:
     """Beats may have become smaller, or what was taken for beats was none: new levels.
 
@@ -296,7 +296,7 @@ def _learn_again(first: int, last: int, racing: bool, plan: Plan, s: State) -> N
             usual.level, lead.noise = level, noise
 
 
-@inner
+@within
 def _accept(at: int, plan: Plan, s: State) -> bool:
     """The wave that was judged last is a beat: learn from it, and report it; whether beats have
     become unclear."""

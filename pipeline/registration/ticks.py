@@ -43,6 +43,7 @@ from pipeline.registration.intervals import (
     VALID,
     interval,
     judge,
+    remember,
     tolerance,
 )
 
@@ -149,7 +150,7 @@ def _forget(c: Float) -> None:
     c[RR] = c[CYCLE_RR]
     c[SPREAD] = 0.05 * c[CYCLE_RR]
     c[NEEDED] = 3.0
-    c[BEFORE:] = c[STATE:BEFORE]
+    remember(c)
 
 
 @inner
@@ -161,7 +162,7 @@ def _is_time(time_s: float) -> bool:
 def beat(c: Float, r_s: float, strange: bool) -> int:
     """An R peak became known; what kind of beat it is, or -1 if it does not count: it is no later
     than the last, or too far ahead of all that the clock was told."""
-    c[BEFORE:] = c[STATE:BEFORE]
+    remember(c)
     if not _is_time(r_s) or (c[BEATS] > 0.0 and not r_s > c[LAST_R]):
         return -1
     # The last beat counts beside the time: the next question may lie far from the last one.
@@ -195,7 +196,8 @@ def take_back(c: Float) -> None:
     """The last beat was none: know what was known before it."""
     # Leads that were lost since are not to be forgotten.
     if c[GAP] == 0.0:
-        c[STATE:BEFORE] = c[BEFORE:]
+        for i in range(BEFORE - STATE):
+            c[STATE + i] = c[BEFORE + i]
 
 
 @inner
