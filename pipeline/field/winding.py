@@ -89,8 +89,9 @@ def _node_range(low, high, start, step, count):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _crossing(vertices, a, b, c, y, z):  # type: ignore[no-untyped-def]
-    """Direction in which the ray crosses the triangle (0: not at all), and where along x."""
+def crossing(vertices, a, b, c, y, z):  # type: ignore[no-untyped-def]
+    """Direction in which the ray along x through (y, z) crosses the triangle (0: not at all), and
+    where; 1 where the triangle faces +x."""
     area_c, side_c = _edge_side(vertices, a, b, y, z)
     area_a, side_a = _edge_side(vertices, b, c, y, z)
     if side_a != side_c or side_a == 0:
@@ -121,7 +122,7 @@ def _count_crossings(vertices, triangles, x_mm, y_mm, z_mm, first, end, winding)
         first_j, end_j = _node_range(min(ya, yb, yc), max(ya, yb, yc), y_mm[0], step_y, len(y_mm))
         for k in range(first_k, end_k):
             for j in range(first_j, end_j):
-                direction, x = _crossing(vertices, a, b, c, y_mm[j], z_mm[k])
+                direction, x = crossing(vertices, a, b, c, y_mm[j], z_mm[k])
                 if direction != 0:
                     # A counter-clockwise triangle seen from +x faces +x: the ray leaves there.
                     behind = math.ceil((x - x_mm[0]) / step_x)

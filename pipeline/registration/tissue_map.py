@@ -11,13 +11,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import gaussian_filter
 
+from pipeline.compiled import door
 from pipeline.errors import InputError
 from pipeline.field.motion import GAP, Motion, between
+from pipeline.field.winding import crossing
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
@@ -37,6 +39,8 @@ _MARGIN_MM = 12.0
 _LONGEST_STEP = 0.06
 # Phases that are worked on at the same time: NumPy and SciPy let others run while they count.
 _THREADS = 2
+
+_compiled = door(Path(__file__).parent, ("tissue_map", "../field/winding"), nogil=True, cache=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,23 +223,7 @@ def _grid_around(surfaces: Sequence[MovingSurface], spacing_mm: float) -> Grid:
     return Grid((z, y, x), origin_mm, (spacing_mm, spacing_mm, spacing_mm))
 
 
-@njit(cache=True, nogil=True)
-def _edge(vertices, i, j, y, z):  # type: ignore[no-untyped-def]
-    """Twice the signed area that the point makes with edge ``i -> j``, and on which side it lies.
-
-    Computed from the lower vertex number on, so that all triangles at an edge get the same number.
-    A point on the line counts as moved by (e, e^2) for an e smaller than any number: so moved it
-    lies on no edge and no corner, and every ray crosses a closed surface an even number of times.
-    """
-    low, high = min(i, j), max(i, j)
-    dy = vertices[high, 1] - vertices[low, 1]
-    dz = vertices[high, 2] - vertices[low, 2]
-    area = dy * (z - vertices[low, 2]) - dz * (y - vertices[low, 1])
-    side = area if area != 0 else (-dz if dz != 0 else dy)
-    return (area, side > 0) if i < j else (-area, side < 0)
-
-
-@njit(cache=True, nogil=True)
+@_compiled
 def _step(changes, x, y, z, sign):  # type: ignore[no-untyped-def]
     """Let the share rise by ``sign`` from position ``x`` on along one ray."""
     cell = math.floor(x + 0.5)
@@ -248,22 +236,18 @@ def _step(changes, x, y, z, sign):  # type: ignore[no-untyped-def]
             changes[cell + 1, y, z] += sign * passed
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _mark_triangle(vertices, a, b, c, bounds, changes):  # type: ignore[no-untyped-def]
     """Steps of one triangle on the rays that cross it."""
     for y in range(bounds[0], bounds[1] + 1):
         for z in range(bounds[2], bounds[3] + 1):
-            to_a, left_a = _edge(vertices, b, c, y, z)
-            to_b, left_b = _edge(vertices, c, a, y, z)
-            to_c, left_c = _edge(vertices, a, b, y, z)
-            area = to_a + to_b + to_c
-            if area != 0 and left_a == left_b == left_c:
-                x = (to_a * vertices[a, 0] + to_b * vertices[b, 0] + to_c * vertices[c, 0]) / area
+            direction, x = crossing(vertices, a, b, c, float(y), float(z))
+            if direction != 0:
                 # Along the ray an outward normal that points back is the way in.
-                _step(changes, x, y, z, -1.0 if left_a else 1.0)
+                _step(changes, x, y, z, -float(direction))
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _mark_crossings(vertices, triangles, changes):  # type: ignore[no-untyped-def]
     """Add all triangles' steps to the running sums along axis 0 of ``changes``."""
     for t in range(len(triangles)):
