@@ -38,13 +38,13 @@ from pipeline.batch_table import write_table as write_csv
 from pipeline.errors import NOT_TO_BE_USED, InputError
 from pipeline.publish import (
     PARTIAL,
-    STAGE_FILE,
     locked,
     read_record,
     readable_write_errors,
     record_stamp,
     remove,
 )
+from pipeline.sealing import STAGE_FILE
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.5

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from pipeline.batch_table import INTERRUPTED
 from pipeline.errors import INTERRUPTED_CODE, NOT_TO_BE_USED
-from pipeline.publish import STAGE_FILE, read_record
+from pipeline.publish import read_record
+from pipeline.sealing import STAGE_FILE
 
 TOLD_TO_END = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _LIBRARIES_SAY = ("Task exception", "Traceback", "Exception ignored")

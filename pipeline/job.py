@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.progress import Progress
-from pipeline.publish import sealed
+from pipeline.sealing import sealed
 
 if TYPE_CHECKING:
     # For types only: a stage's product must not depend on the settings of other stages.

@@ -28,8 +28,9 @@ from pipeline.field.winding import winding_number
 from pipeline.geometry import Surface, require_rigid
 from pipeline.meshes import MESH_ENDINGS, read_mesh
 from pipeline.progress import Progress
-from pipeline.publish import only_run_in, publishing, sha256_of
+from pipeline.publish import only_run_in, publishing
 from pipeline.regular_files import require_no_device
+from pipeline.sealing import sha256_of
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
 from pipeline.validation import Section, describe_validation

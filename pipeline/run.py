@@ -19,18 +19,14 @@ from pipeline.config import Settings
 from pipeline.errors import NOT_TO_BE_USED, BeatfieldError, InputError
 from pipeline.job import Job, Skipped
 from pipeline.memory import PeakMemory
-from pipeline.publish import (
+from pipeline.publish import only_run_in, publishing, read_record, remove, write_json
+from pipeline.sealing import (
     code_digest,
     fingerprint,
     library_versions,
-    only_run_in,
-    publishing,
-    read_record,
-    remove,
     require_unaltered,
     seal,
     sealed,
-    write_json,
 )
 from pipeline.study import Study
 from pipeline.summary import remarks

@@ -17,8 +17,8 @@ from pydantic import Field, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
-from pipeline.publish import sha256_of
 from pipeline.regular_files import require_no_device
+from pipeline.sealing import sha256_of
 from pipeline.study_files import files_below, record_files, require_signals, sweep_files
 from pipeline.study_folders import (
     NIFTI_ENDINGS,

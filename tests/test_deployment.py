@@ -156,8 +156,8 @@ def test_a_terminal_of_few_letters_is_shown_the_others_numbers(tmp_path: Path) -
 
 def test_files_are_read_and_written_alike_whatever_letters_the_system_knows(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from pipeline import publish, products; "
-        "publish.code_digest('pipeline.stages.ingest'); "
+        "import sys; from pathlib import Path; from pipeline import products, sealing; "
+        "sealing.code_digest('pipeline.stages.ingest'); "
         "row = products.FrameRow('us-\\xe9', 0, 0.0, 0.0, 0.0, True); path = Path(sys.argv[1]); "
         "products.write_frames(path, [row]); "
         "assert products.read_frames(path) == [row]"

@@ -22,12 +22,8 @@ from pipeline.report import pictures, slices
 from pipeline.report.animation import _webp, first_frame
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, render
-from pipeline.stages.report import (
-    _frames_shown,
-    _of_whole_ventricles,
-    _opening,
-    _registration_notes,
-)
+from pipeline.report.registered import frames_shown, registration_notes
+from pipeline.stages.report import _of_whole_ventricles, _opening
 from pipeline.summary import doubts, remarks
 
 
@@ -39,7 +35,7 @@ def notes(us: object, figures: dict[str, Any] | None) -> list[str]:
         figures=lambda stage: figures,
         skipped={"register": "frames agree with nothing"},
     )
-    return _registration_notes(cast(Job, job))
+    return registration_notes(cast(Job, job))
 
 
 def test_ultrasound_that_was_not_registered_is_not_called_missing() -> None:
@@ -149,11 +145,11 @@ def test_lines_on_a_frame_are_those_of_its_own_phase() -> None:
 
 def test_a_frame_that_speaks_against_a_registration_is_shown() -> None:
     rows = [FrameRow("a", k, k / 20, 0.1, 0.4 + 0.6 * (k == 30), k < 25) for k in range(31)]
-    assert [row.frame for row in _frames_shown(rows)] == [0, 12, 24, 27]
-    assert [row.frame for row in _frames_shown(rows[:25])] == [0, 8, 16, 24]
+    assert [row.frame for row in frames_shown(rows)] == [0, 12, 24, 27]
+    assert [row.frame for row in frames_shown(rows[:25])] == [0, 8, 16, 24]
     # Of few frames each is shown once.
-    assert [row.frame for row in _frames_shown(rows[:3])] == [0, 1, 2]
-    assert _frames_shown([]) == []
+    assert [row.frame for row in frames_shown(rows[:3])] == [0, 1, 2]
+    assert frames_shown([]) == []
 
 
 def test_what_of_the_folder_is_not_used_is_told_in_one_line() -> None:

@@ -26,14 +26,8 @@ from pipeline import run as runner
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
-from pipeline.publish import (
-    LIBRARIES,
-    PARTIAL,
-    code_digest,
-    only_run_in,
-    publishing,
-    readable_write_errors,
-)
+from pipeline.publish import PARTIAL, only_run_in, publishing, readable_write_errors
+from pipeline.sealing import LIBRARIES, code_digest
 from pipeline.study import open_study
 
 
@@ -431,7 +425,7 @@ def test_a_refusal_of_the_system_is_noticed_whatever_writes(tmp_path: Path) -> N
 
 
 def test_code_digest_follows_imports_but_not_those_of_other_stages() -> None:
-    from pipeline.publish import _import_closure
+    from pipeline.sealing import _import_closure
 
     names = {path.name for path in _import_closure("pipeline.stages.ingest")}
     assert {"ingest.py", "dicom.py", "nifti.py", "cine.py", "job.py", "errors.py"} <= names

@@ -10,24 +10,20 @@ import numpy as np
 from pipeline import __version__
 from pipeline.field.fixture import Fixture
 from pipeline.field.reader import ForceField
-from pipeline.geometry import Float, MovingSurface
+from pipeline.geometry import Float
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.nifti import read_image
 from pipeline.imaging.settings import LOW_CONFIDENCE
-from pipeline.imaging.ultrasound import read_sweeps
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
-from pipeline.products import FrameRow, read_cine, read_frames, read_surfaces, read_table
-from pipeline.registration.correction import put_right
-from pipeline.registration.reading import Reader
-from pipeline.registration.uncertainty import expected_tre_mm
-from pipeline.report import certainty, certificate, heart, pictures, slices
+from pipeline.products import read_cine, read_frames, read_surfaces, read_table
+from pipeline.report import certificate, heart, pictures, slices
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
-from pipeline.report.style import as_png, as_svg, as_webp
+from pipeline.report.registered import registration, registration_notes
+from pipeline.report.style import as_png, as_svg
 from pipeline.summary import (
     by_reason,
-    clock_put_right,
     cut_off_by,
     cut_sideways_by,
     doubts,
@@ -35,13 +31,8 @@ from pipeline.summary import (
     series_left_out,
 )
 
-ULTRASOUND_FRAMES_SHOWN = 4
 VENTRICLES = {"left ventricle", "right ventricle"}
 """Their volumes are told at the top of the page, whatever the fixtures."""
-NOT_USED_TOLD = (
-    "The last frame is one of those that do not bear the registration out: it shows something "
-    "else, or the heart beside its place. "
-)
 FIELD_TOLD = (
     "The epicardium is the outside of the left ventricle's muscle: its free wall, the right side "
     "of the septum, and a lid at the valves. The potential over an MR slice, lines of equal "
@@ -53,11 +44,6 @@ FIELD_TOLD = (
     "is measured exceeds it at the share of places that is told: beside a medial axis, where two "
     "parts of the surface are equally near and the force changes with place as fast as the grid's "
     "spacing allows."
-)
-BLOOD_TOLD = (
-    "The second row shows where blood of the cavities was found in the same frames, light where it "
-    "is certain: this is what the surfaces were laid over, and it should fill the lines of the "
-    "cavities. "
 )
 
 
@@ -74,7 +60,7 @@ def run(job: Job) -> dict[str, Any]:
     sections = [
         heart.segmentation(shown, confidence, LOW_CONFIDENCE),
         heart.movement(surfaces, rr_s, phases, measures),
-        *_registration(job, surfaces),
+        *registration(job, surfaces),
         _field(job, shown),
         *_evaluation(job),
     ]
@@ -250,87 +236,8 @@ def _warnings(job: Job) -> list[str]:
         notes.append(f"No surface of {', '.join(names).replace('_', ' ')}: {why}.")
     for name, why in job.figures("bake")["left_out"].items():
         notes.append(f"Left out: the default fixture {name}, which {why}.")
-    notes += _registration_notes(job)
+    notes += registration_notes(job)
     return notes
-
-
-def _registration_notes(job: Job) -> list[str]:
-    """What to mind of the ultrasound, before anything is looked at."""
-    if job.study.us is None:
-        return []
-    if not job.product("register"):
-        return [f"The tracked ultrasound could not be registered: {job.skipped['register']}."]
-    figures = job.figures("register")
-    notes = [f"Clocks: {text}." for text in clock_put_right(figures)]
-    if figures["verdict"] != "good":
-        notes.append(f"Registration {figures['verdict']}: {figures['reason']}.")
-    return notes
-
-
-def _registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]:
-    folder = job.product("register")
-    if folder is None or job.study.us is None:
-        return []
-    found = read_table(folder / "mr_from_tracker.json")
-    mr_from_tracker = np.array(found["mr_from_tracker"])
-    covariance, centre_mm = np.array(found["covariance"]), np.array(found["centre_mm"])
-    chosen = _frames_shown(read_frames(folder / "frames.csv"))
-    sweeps = {sweep.name: sweep for sweep in read_sweeps(job.study.us)}
-    places = [sweeps[row.sweep].numbers.tolist().index(row.frame) for row in chosen]
-    # Probes differ, and so may the sizes of their pictures.
-    images = [sweeps[row.sweep].images[at] for row, at in zip(chosen, places, strict=True)]
-    tracker_from_image = {
-        name: put_right(sweep.tracker_from_image, name, found["calibration"])
-        for name, sweep in sweeps.items()
-    }
-    image_from_mr = np.stack(
-        [
-            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][at])
-            for row, at in zip(chosen, places, strict=True)
-        ]
-    )
-    names = [
-        ("" if row.valid else "NOT USED:\n") + f"{row.sweep}, frame {row.frame}" for row in chosen
-    ]
-    phases = np.array([row.phase for row in chosen])
-    blood = []
-    if job.figures("register")["reading"] == "network":
-        readers = {name: Reader.of(sweeps[name]) for name in {row.sweep for row in chosen}}
-        for row, image in zip(chosen, images, strict=True):
-            reader = readers[row.sweep]
-            blood.append(pictures.BloodFound(reader.read(image[None])[0], reader.step))
-    figure = pictures.cuts_on_ultrasound(images, names, image_from_mr, phases, surfaces, blood)
-    heart_in_mm = certainty.expected_error(
-        surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
-    )
-    return [
-        Section(
-            "Registration",
-            "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
-            "phase of the heartbeat. Where the lines follow the walls, the registration holds. "
-            + ("" if all(row.valid for row in chosen) else NOT_USED_TOLD)
-            + (BLOOD_TOLD if blood else "")
-            + "At last, how far off it is to be expected at each place of the heart.",
-            [
-                picture("Ultrasound with the registered surfaces", as_png(figure), "png"),
-                picture(
-                    "Expected registration error over the heart, root mean square",
-                    as_webp(heart_in_mm, 110),
-                    "webp",
-                ),
-            ],
-        )
-    ]
-
-
-def _frames_shown(rows: list[FrameRow]) -> list[FrameRow]:
-    """Frames that bear the registration out, evenly, and the middle one of those that do not."""
-    used = [row for row in rows if row.valid]
-    # Of a residual of 1 nothing could be compared: the probe was in air, say.
-    against = [row for row in rows if not row.valid and row.residual < 1]
-    count = min(ULTRASOUND_FRAMES_SHOWN - bool(against), len(used))
-    chosen = [used[k] for k in np.linspace(0, len(used) - 1, count).astype(int)]
-    return chosen + against[len(against) // 2 :][:1]
 
 
 def _field(job: Job, shown: Moments) -> Section:
