@@ -71,7 +71,7 @@ bench: setup ## speed beside peers, as ratios in one run
 TRAIN := $(BIN)/python -m data_synth.training --pool training/pool --workers $(WORKERS)
 NARROW := --widths 16 40 88 168 272
 
-train: setup ## make both networks' weights anew from the phantom (PyTorch; a GPU: an hour); again: goes on
+train: setup ## make both networks' weights anew, or go on with that (needs PyTorch; a GPU: an hour)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[train]'
 	$(TRAIN) --out training $(NARROW) --steps 87850 --fresh 4 --without span --without filters \
 		--without mishaps

@@ -24,7 +24,12 @@ def write_random(path: Path, width: int, phases: Float, height: int = 5, depth: 
         mr_from_tracker=None,
         grid=GridPart(shape_zyx=shape, origin_mm=ORIGIN_MM, spacing_mm=SPACING_MM),
         structures={
-            "s": StructurePart(path="distance/s", spline="spline/s", triangles=[], volume_ml=[])
+            "s": StructurePart(
+                path="distance/s",
+                spline="spline/s",
+                triangles=[0] * len(phases),
+                volume_ml=[0.0] * len(phases),
+            )
         },
         fixtures={"f": FixturePart.of("f", law)},
         source={},

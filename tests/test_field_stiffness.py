@@ -158,7 +158,7 @@ def write_field(path, distance, fixture: Fixture) -> ForceField:
         mr_from_tracker=None,
         grid=GridPart(shape_zyx=grid.shape, origin_mm=grid.origin_mm, spacing_mm=grid.spacing_mm),
         structures={
-            "s": StructurePart(path="distance/s", spline="spline/s", triangles=[], volume_ml=[])
+            "s": StructurePart(path="distance/s", spline="spline/s", triangles=[0], volume_ml=[0])
         },
         fixtures={"f": FixturePart.of("f", fixture)},
         source={},

@@ -293,6 +293,11 @@ def test_a_store_without_manifest_is_none(copy, tmp_path):
     [
         ("mr_from_tracker", np.diag([2.0, 1, 1, 1]).tolist(), "mr_from_tracker: is not a rotation"),
         ("phases", [0.0, 0.5, 0.99995], "lie 5e-05 of a cycle apart"),
+        (
+            "phases",
+            [0.0, 0.1, 0.2, 0.5],
+            "triangles and volume_ml need 4 numbers, one a phase",
+        ),
     ],
 )
 def test_a_description_that_is_none_is_told_with_its_file(copy, key, value, words):

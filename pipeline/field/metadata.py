@@ -170,6 +170,11 @@ class FieldMetadata(Part):
                 raise ValueError(f"structure {name}: path {structure.path!r} is not its own")
             if structure.spline != f"spline/{name}":
                 raise ValueError(f"structure {name}: spline {structure.spline!r} is not its own")
+            if not len(structure.triangles) == len(structure.volume_ml) == len(self.phases):
+                raise ValueError(
+                    f"structure {name}: triangles and volume_ml need {len(self.phases)} numbers, "
+                    f"one a phase, not {len(structure.triangles)} and {len(structure.volume_ml)}"
+                )
         for name, fixture in self.fixtures.items():
             require_name(name, "fixture")
             if fixture.path != f"potential/{name}":

@@ -90,10 +90,10 @@ def stiffness_words(figures: Mapping[str, Any]) -> str:
 
 def _measured(field: ForceField, name: str) -> float | None:
     """The fixture's stiffness by the field's certificate, N/m."""
-    found: float | None = (
-        field.accuracy.get("fixtures", {}).get(name, {}).get("stiffness_measured_n_per_m")
-    )
-    return found
+    told = field.accuracy.get("fixtures", {})
+    found = told.get(name, {}) if isinstance(told, dict) else {}
+    measured = found.get("stiffness_measured_n_per_m") if isinstance(found, dict) else None
+    return measured if isinstance(measured, int | float) else None
 
 
 def _force_rate(

@@ -180,8 +180,11 @@ def _array(path: Path, name: str, metadata: FieldMetadata) -> Iterator[str]:
     """What in an array's own description disagrees with the format."""
     try:
         described = json.loads((path / name / "zarr.json").read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         yield f"{name}/zarr.json: cannot be read ({error})"
+        return
+    if not isinstance(described, dict):
+        yield f"{name}/zarr.json: is no description of an array"
         return
     shape = list(metadata.grid.shape_zyx)
     expected = {

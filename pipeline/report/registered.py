@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
+from matplotlib.figure import Figure
 
 from pipeline.geometry import MovingSurface
-from pipeline.imaging.ultrasound import read_sweeps
+from pipeline.imaging.ultrasound import Sweep, read_sweeps
 from pipeline.job import Job
 from pipeline.products import FrameRow, read_frames, read_table
 from pipeline.registration.correction import put_right
@@ -47,34 +51,10 @@ def registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]:
     if folder is None or job.study.us is None:
         return []
     found = read_table(folder / "mr_from_tracker.json")
-    mr_from_tracker = np.array(found["mr_from_tracker"])
     covariance, centre_mm = np.array(found["covariance"]), np.array(found["centre_mm"])
     chosen = frames_shown(read_frames(folder / "frames.csv"))
-    sweeps = {sweep.name: sweep for sweep in read_sweeps(job.study.us)}
-    places = [sweeps[row.sweep].numbers.tolist().index(row.frame) for row in chosen]
-    # Probes differ, and so may the sizes of their pictures.
-    images = [sweeps[row.sweep].images[at] for row, at in zip(chosen, places, strict=True)]
-    tracker_from_image = {
-        name: put_right(sweep.tracker_from_image, name, found["calibration"])
-        for name, sweep in sweeps.items()
-    }
-    image_from_mr = np.stack(
-        [
-            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][at])
-            for row, at in zip(chosen, places, strict=True)
-        ]
-    )
-    names = [
-        ("" if row.valid else "NOT USED:\n") + f"{row.sweep}, frame {row.frame}" for row in chosen
-    ]
-    phases = np.array([row.phase for row in chosen])
-    blood = []
-    if job.figures("register")["reading"] == "network":
-        readers = {name: Reader.of(sweeps[name]) for name in {row.sweep for row in chosen}}
-        for row, image in zip(chosen, images, strict=True):
-            reader = readers[row.sweep]
-            blood.append(pictures.BloodFound(reader.read(image[None])[0], reader.step))
-    figure = pictures.cuts_on_ultrasound(images, names, image_from_mr, phases, surfaces, blood)
+    by_network = job.figures("register")["reading"] == "network"
+    figure = _cuts(chosen, read_sweeps(job.study.us), found, surfaces, by_network)
     heart_in_mm = certainty.expected_error(
         surfaces, lambda points_mm: expected_tre_mm(covariance, centre_mm, points_mm)
     )
@@ -84,7 +64,7 @@ def registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]:
             "The MR's surfaces cut by the plane of tracked ultrasound frames, each at its own "
             "phase of the heartbeat. Where the lines follow the walls, the registration holds. "
             + ("" if all(row.valid for row in chosen) else NOT_USED_TOLD)
-            + (BLOOD_TOLD if blood else "")
+            + (BLOOD_TOLD if by_network else "")
             + "At last, how far off it is to be expected at each place of the heart.",
             [
                 picture("Ultrasound with the registered surfaces", as_png(figure), "png"),
@@ -96,6 +76,42 @@ def registration(job: Job, surfaces: dict[str, MovingSurface]) -> list[Section]:
             ],
         )
     ]
+
+
+def _cuts(
+    chosen: Sequence[FrameRow],
+    sweeps: Sequence[Sweep],
+    found: Mapping[str, Any],
+    surfaces: Mapping[str, MovingSurface],
+    by_network: bool,
+) -> Figure:
+    """Frames with the surfaces where they cut them, and with the blood that the network found."""
+    named = {sweep.name: sweep for sweep in sweeps}
+    places = [named[row.sweep].numbers.tolist().index(row.frame) for row in chosen]
+    # Probes differ, and so may the sizes of their pictures.
+    images = [named[row.sweep].images[at] for row, at in zip(chosen, places, strict=True)]
+    tracker_from_image = {
+        name: put_right(sweep.tracker_from_image, name, found["calibration"])
+        for name, sweep in named.items()
+    }
+    mr_from_tracker = np.array(found["mr_from_tracker"])
+    image_from_mr = np.stack(
+        [
+            np.linalg.inv(mr_from_tracker @ tracker_from_image[row.sweep][at])
+            for row, at in zip(chosen, places, strict=True)
+        ]
+    )
+    titles = [
+        ("" if row.valid else "NOT USED:\n") + f"{row.sweep}, frame {row.frame}" for row in chosen
+    ]
+    phases = np.array([row.phase for row in chosen])
+    blood = []
+    if by_network:
+        readers = {name: Reader.of(named[name]) for name in {row.sweep for row in chosen}}
+        for row, image in zip(chosen, images, strict=True):
+            reader = readers[row.sweep]
+            blood.append(pictures.BloodFound(reader.read(image[None])[0], reader.step))
+    return pictures.cuts_on_ultrasound(images, titles, image_from_mr, phases, surfaces, blood)
 
 
 def frames_shown(rows: list[FrameRow]) -> list[FrameRow]:
