@@ -249,6 +249,17 @@ def test_ultrasound_of_oblong_pixels_is_shown_in_proportion() -> None:
     assert [axis.get_aspect() for axis in figure.axes] == [1.0, 1.5]
 
 
+def test_a_frame_has_a_scale_in_millimetres_of_the_patient() -> None:
+    images, names = [np.zeros((80, 100), np.float32)] * 2, ["a", "b"]
+    given = np.stack([np.diag([4.0, 4, 4, 1]), np.diag([1 / 2, 1 / 3, 1, 1])])
+    figure = pictures.cuts_on_ultrasound(images, names, given, np.zeros(2), {})
+    for axis, pixels in zip(figure.axes, (80.0, 10.0), strict=True):
+        lengths = [np.ptp(line.get_xdata()) for line in axis.lines]
+        # 20 mm; one that is longer than half of the picture is not drawn.
+        assert lengths == pytest.approx([pixels] if pixels < 50 else [])
+        assert [text.get_text() for text in axis.texts] == ["20 mm"] * len(lengths)
+
+
 def test_blood_that_was_found_lies_where_it_was_found_in_the_frame() -> None:
     step = np.array([2.0, 3.0])
     blood = pictures.BloodFound(np.zeros((5, 4), np.float32), step)

@@ -26,7 +26,7 @@ from pipeline.geometry import (
 from pipeline.imaging.labels import LABELS
 from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
-from pipeline.report.slices import mark_sides
+from pipeline.report.slices import mark_scale, mark_sides
 from pipeline.report.style import handle, show_grey, words
 
 
@@ -107,14 +107,17 @@ def cuts_on_ultrasound(
     axes = figure.subplots(tall, len(images), squeeze=False)
     frames = zip(axes[0], images, names, image_from_mr, phases, strict=True)
     for axis, image, called, transform, phase in frames:
-        show_grey(axis, image, _aspect(transform))
+        wide_mm, high_mm = _pixel_mm(transform)
+        show_grey(axis, image, high_mm / wide_mm)
+        mark_scale(axis, wide_mm)
         _draw_cuts(axis, image.shape, transform, float(phase), surfaces)
         # Names of files may hold what would be taken for a formula.
         axis.set_title(f"{called}, phase {phase:.2f}", fontsize=9, parse_math=False)
     if found:
         below = zip(axes[1], images, found, image_from_mr, phases, strict=True)
         for axis, image, blood, transform, phase in below:
-            _show_blood(axis, blood, _aspect(transform))
+            wide_mm, high_mm = _pixel_mm(transform)
+            _show_blood(axis, blood, high_mm / wide_mm)
             _draw_cuts(axis, image.shape, transform, float(phase), surfaces)
             axis.set_title("blood found (light)", fontsize=9)
     drawn = {name: style for name, style in SURFACE_STYLES.items() if name in surfaces}
@@ -127,10 +130,10 @@ def cuts_on_ultrasound(
     return figure
 
 
-def _aspect(image_from_mr: Float) -> float:
-    """Height of a pixel over its width."""
+def _pixel_mm(image_from_mr: Float) -> tuple[float, float]:
+    """Width and height of a pixel."""
     wide_mm, high_mm = np.linalg.norm(np.linalg.inv(image_from_mr)[:3, :2], axis=0)
-    return float(high_mm / wide_mm)
+    return float(wide_mm), float(high_mm)
 
 
 def _show_blood(axis: Axes, found: BloodFound, aspect: float) -> None:

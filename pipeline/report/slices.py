@@ -90,11 +90,12 @@ def mark_sides(axis: Axes, shown: Moments) -> None:
         axis.text(x, y, text, transform=axis.transAxes, color="white", fontsize=8, **style)
 
 
-def mark_scale(axis: Axes, shown: Moments) -> None:
-    """Draw `SCALE_MM` of the patient into the lower left of a slice's picture, if it has room."""
+def mark_scale(axis: Axes, pixel_mm: float) -> None:
+    """Draw `SCALE_MM` of the patient into the lower left of a picture of pixels so wide, if it has
+    room."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     start, height = left + 0.06 * (right - left), bottom + 0.14 * (top - bottom)
-    length = SCALE_MM / float(np.linalg.norm(shown.mr_from_index[:3, 0]))
+    length = SCALE_MM / pixel_mm
     if length > 0.5 * (right - left):
         return
     edge: list[AbstractPathEffect] = [Stroke(linewidth=4, foreground="black"), Normal()]
@@ -152,7 +153,7 @@ def contours(
         _title(axis, name, sure, low)
     # One is enough: all slices of a stack lie alike.
     mark_sides(axes[0], shown)
-    mark_scale(axes[0], shown)
+    mark_scale(axes[0], float(np.linalg.norm(shown.mr_from_index[:3, 0])))
     _legend(figure)
     return figure
 
