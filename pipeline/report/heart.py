@@ -94,7 +94,10 @@ def _muscle(phases: Float, measures: Mapping[str, Any]) -> list[Picture]:
     shown = [picture("Left muscle: mass and mean wall thickness", muscle, "svg")]
     if thickness["segments"]:
         cells = as_png(curves.thickness_map(phases, thickness["segments"]), 110)
-        shown.append(picture("Wall thickness by segment", cells, "png"))
+        told = (
+            "Wall thickness by segment; the apex, which slices cut at a slant, is the least exact"
+        )
+        shown.append(picture(told, cells, "png"))
     return shown
 
 
