@@ -33,7 +33,7 @@ from pipeline.regular_files import require_no_device
 from pipeline.sealing import sha256_of
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
-from pipeline.validation import Section, describe_validation
+from pipeline.validation import Section, describe_validation, each_key_once
 
 SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
 """From end to end; a heart in metres or micrometres lies outside."""
@@ -392,7 +392,7 @@ def _timing(path: Path, phase_count: int) -> Timing:
 
 def _read_timing(path: Path) -> Timing:
     try:
-        return Timing.model_validate(json.loads(path.read_bytes()))
+        return Timing.model_validate(json.loads(path.read_bytes(), object_pairs_hook=each_key_once))
     except ValidationError as error:
         raise InputError(describe_validation(error, str(path), Timing)) from error
     except (OSError, ValueError, RecursionError) as error:

@@ -40,6 +40,22 @@ def find_truth(value: Any) -> bool | None:
     return value if isinstance(value, bool) else None
 
 
+def each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Keys and values of an object in JSON, whose reader else keeps the last of each name.
+
+    Raises
+    ------
+    ValueError
+        When a key is given twice.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"{key} is given a second time; keep one of them")
+        found[key] = value
+    return found
+
+
 def _kinds(annotation: Any) -> set[Any]:
     """The types that an annotation is made of."""
     return {annotation}.union(*map(_kinds, get_args(annotation)))

@@ -258,6 +258,15 @@ def test_an_ecg_that_promises_more_than_it_describes_is_refused_at_once(tmp_path
         read_ecg(tmp_path / "a.csv")
 
 
+def test_a_timing_that_gives_a_key_twice_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "cine.nii"
+    nibabel.save(nibabel.Nifti1Image(np.ones((8, 8, 4, 5), np.float32), np.eye(4)), path)
+    times = '"trigger_times_ms": [0, 160, 320, 480, 640]'
+    (tmp_path / "timing.json").write_text(f'{{{times}, "rr_ms": 800, "rr_ms": 900}}')
+    with pytest.raises(InputError, match="rr_ms is given a second time; keep one of them"):
+        read_nifti_cine(path, tmp_path / "timing.json", None)
+
+
 @pytest.mark.parametrize("text", ["!!bool maybe", "!!int ''", "!!float ''", "!!timestamp foo"])
 def test_a_tag_that_does_not_fit_is_told(tmp_path: Path, text: str) -> None:
     path = tmp_path / "study.yaml"

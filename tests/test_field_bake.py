@@ -395,6 +395,10 @@ def inward_box(folder):
             r"000\.vtp: measures 0\.06 mm .*milli",
         ),
         (lambda f: (f / "phases.json").write_text("{"), r"phases\.json: cannot be read as JSON"),
+        (
+            lambda f: (f / "phases.json").write_text('{"rr_s": 0.8, "rr_s": 0.9}'),
+            r"phases\.json: cannot be read as JSON \(rr_s is given a second time",
+        ),
         (lambda f: shutil.rmtree(f), "no such folder"),
         (lambda f: (shutil.rmtree(f), f.mkdir()), r"holds no \.vtp"),
         (

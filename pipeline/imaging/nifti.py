@@ -31,7 +31,7 @@ from pipeline.imaging.nifti_doubts import (
     doubts_of_values,
 )
 from pipeline.imaging.phases import PLAUSIBLE_RR_S, common_phases
-from pipeline.validation import find_truth
+from pipeline.validation import each_key_once, find_truth
 
 # The library mends headers and tells people so, in words of its own; what matters of it is refused.
 _told_mends.setLevel(logging.CRITICAL)
@@ -350,7 +350,7 @@ def _timing_file(path: Path, phases: int, slices: int) -> tuple[Float, Float]:
         f'"rr_ms" as {slices} numbers (or one)'
     )
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=each_key_once)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: cannot be read as JSON ({error}); write it as docs/study.md shows, in UTF-8"
