@@ -196,7 +196,8 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
     told = ["Research software: not a medical device, and not for use on patients."]
     if job.product("evaluate"):
         told.append(
-            "This study has a known truth (the last section): it is synthetic, not a patient's."
+            "This study comes with a truth to be compared with (the last section), as synthetic "
+            "ones do, which are no patient's."
         )
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
@@ -298,7 +299,7 @@ def _evaluation(job: Job) -> list[Section]:
     return [
         Section(
             "Against truth",
-            "This study is synthetic, so its truth is known; only the evaluate stage reads it. "
+            "What the study's truth/ tells, which only the evaluate stage reads. "
             "Dice is that of the labels: in the row of the epicardium of heart muscle, in that of "
             "the LV endocardium of the cavity. Errors of the frames' phases are shares of a beat.",
             tables=[Table(head, rows), flat_table("registration and volumes", others)],
