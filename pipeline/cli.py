@@ -229,7 +229,9 @@ def query(
     as_json
         Print JSON.
     """
-    answers = _ask(field, point, phase, fixture)
+    from pipeline.field.query import limits_words, query_inside
+
+    answers = query_inside(field, point, phase, fixture)
     if as_json:
         show(json.dumps(answers))
         return 0
@@ -238,34 +240,9 @@ def query(
         force = " ".join(f"{round(value, 4) + 0.0:+.4f}" for value in answer["force_n"])
         show(
             f"{name}: distance {answer['distance_mm']:+.3f} mm, "
-            f"potential {answer['potential']:.4f}, force {force} N{_limits(answer)}"
+            f"potential {answer['potential']:.4f}, force {force} N{limits_words(answer)}"
         )
     return 0
-
-
-def _limits(answer: dict[str, Any]) -> str:
-    """What a device has to follow: how fast the force changes, and how stiff the fixture is."""
-    from pipeline.field.query import stiffness_words
-
-    rate = answer["force_rate_n_per_ms"]
-    changing = "" if rate is None else f", changing by {rate:.4f} N/ms"
-    return f"{changing}, {stiffness_words(answer)}"
-
-
-def _ask(
-    path: Path, point: tuple[float, float, float], phase: float, fixture: str | None
-) -> dict[str, dict[str, Any]]:
-    """Distance, potential and force of one fixture, or of all."""
-    from pipeline.field.query import query_point
-
-    answers = query_point(path, point, phase, fixture)
-    if not all(answer["inside_grid"] for answer in answers.values()):
-        where = " ".join(f"{value:g}" for value in point)
-        raise InputError(
-            f"--point {where}: lies outside the baked grid of {path}; give LPS millimetres of "
-            "the MR frame, near the surfaces"
-        )
-    return answers
 
 
 @app.command

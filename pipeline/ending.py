@@ -36,24 +36,7 @@ def guarded(command: Callable[[], Any]) -> int:
         silence(sys.stdout, sys.stderr)
         return 128 + signal.SIGPIPE
     except OSError as error:
-        if error.filename is not None and error.errno in OUT_OF_REACH:
-            say(
-                f"error: {os.fsdecode(error.filename)}: cannot be reached ({error.strerror}); mend "
-                "its name or its rights, or name another place"
-            )
-            return 2
-        # Of a file there would be its name.
-        if error.errno not in NO_SPACE or error.filename is not None:
-            raise
-        silence(sys.stdout)
-        places = f"{tempfile.gettempdir()} (TMPDIR)"
-        if kept := os.environ.get("NUMBA_CACHE_DIR"):
-            places += f", {kept} (NUMBA_CACHE_DIR)"
-        say(
-            "error: what is printed, a temporary file or compiled code cannot be written "
-            f"({error.strerror}); free some space, also in {places}"
-        )
-        return 2
+        return _of_the_system(error)
     except RuntimeError as error:
         # So the library for paths tells links that lead to one another.
         if "Symlink loop" not in str(error):
@@ -72,3 +55,25 @@ def guarded(command: Callable[[], Any]) -> int:
         tell_notes(interrupt)
         return INTERRUPTED_CODE
     return code if isinstance(code, int) else 0
+
+
+def _of_the_system(error: OSError) -> int:
+    """Tell what the system refused; the exit code. What is a fault of the program is raised."""
+    if error.filename is not None and error.errno in OUT_OF_REACH:
+        say(
+            f"error: {os.fsdecode(error.filename)}: cannot be reached ({error.strerror}); mend "
+            "its name or its rights, or name another place"
+        )
+        return 2
+    # Of a file there would be its name.
+    if error.errno not in NO_SPACE or error.filename is not None:
+        raise error
+    silence(sys.stdout)
+    places = f"{tempfile.gettempdir()} (TMPDIR)"
+    if kept := os.environ.get("NUMBA_CACHE_DIR"):
+        places += f", {kept} (NUMBA_CACHE_DIR)"
+    say(
+        "error: what is printed, a temporary file or compiled code cannot be written "
+        f"({error.strerror}); free some space, also in {places}"
+    )
+    return 2

@@ -24,6 +24,7 @@ from pipeline.sealing import (
     code_digest,
     fingerprint,
     library_versions,
+    require_same_study,
     require_unaltered,
     seal,
     sealed,
@@ -129,7 +130,7 @@ def run_study(
     forced = STAGE_NAMES[STAGE_NAMES.index(first) :] if first else ()
     with only_run_in(products):
         inputs = study.input_digests()
-        _require_same_study(study, inputs, products)
+        require_same_study(study.folder, study.patient_id, inputs, products, STAGE_NAMES)
         run = _Run(study, settings, products, watcher, inputs, _earlier_stages(products))
         try:
             # From here on it is told which products are old, however the run ends.
@@ -344,28 +345,6 @@ def _described(study: Study, stage: Stage) -> dict[str, Any]:
     if "us" in stage.inputs and study.us:
         says["us"] = study.us.model_dump(exclude={"sweeps"})
     return says
-
-
-def _require_same_study(study: Study, inputs: dict[str, dict[str, str]], products: Path) -> None:
-    """Another patient's products under the same patient id are not replaced.
-
-    A study may be moved, or its files exchanged where they are; not both at once.
-    """
-    earlier = read_record(products)
-    folder, known = earlier.get("study"), earlier.get("inputs")
-    if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study.folder):
-        return
-    before, now = (kinds.get("cine") for kinds in (known, inputs))
-    if not isinstance(before, dict) or not before or not now:
-        return
-    if not any(sealed(products / stage) for stage in STAGE_NAMES):
-        return
-    if set(map(str, before.values())).isdisjoint(now.values()):
-        raise InputError(
-            f"{products}: holds the products of another study, {folder}, which has the patient id "
-            f"{study.patient_id!r} too and no image in common with {study.folder}; choose another "
-            "--out, or give this study a patient_id of its own in study.yaml"
-        )
 
 
 def _earlier_stages(products: Path) -> Mapping[str, Any]:

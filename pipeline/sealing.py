@@ -9,14 +9,14 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.publish import write_json
+from pipeline.publish import read_record, write_json
 
 STAGE_FILE = "stage.json"
 
@@ -88,6 +88,40 @@ def require_unaltered(folder: Path) -> None:
                 "damaged on the disk; to make it anew: beatfield run STUDY --out "
                 f"{folder.parent.parent} --from {folder.name}"
             )
+
+
+def require_same_study(
+    study: Path,
+    patient_id: str,
+    inputs: Mapping[str, Mapping[str, str]],
+    products: Path,
+    stages: Sequence[str],
+) -> None:
+    """Another patient's products under the same patient id are not replaced.
+
+    A study may be moved, or its files exchanged where they are; not both at once.
+
+    Raises
+    ------
+    InputError
+        When the products of any stage are those of a study that lies elsewhere, and has no image
+        in common with this one.
+    """
+    earlier = read_record(products)
+    folder, known = earlier.get("study"), earlier.get("inputs")
+    if not isinstance(folder, str) or not isinstance(known, dict) or folder == str(study):
+        return
+    before, now = (kinds.get("cine") for kinds in (known, inputs))
+    if not isinstance(before, dict) or not before or not now:
+        return
+    if not any(sealed(products / stage) for stage in stages):
+        return
+    if set(map(str, before.values())).isdisjoint(now.values()):
+        raise InputError(
+            f"{products}: holds the products of another study, {folder}, which has the patient id "
+            f"{patient_id!r} too and no image in common with {study}; choose another "
+            "--out, or give this study a patient_id of its own in study.yaml"
+        )
 
 
 def fingerprint(parts: Mapping[str, Any]) -> str:

@@ -155,18 +155,7 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
         rows, columns = other_span(rng, planes[REACH], rows, columns)
     if scar is not None and parts.shape and rng.random() < 0.6:
         rows, columns = bulged(rng, scar, rows, columns)
-    image = np.empty((3, CROP, CROP), np.float32)
-    strays = parts.neighbours and rng.random() < 0.7
-    strayed_px = rng.uniform(0.0, 2.2) if strays else 0.0
-    for channel in range(3):
-        # Every slice is a breath-hold of its own: the heart does not come back to the millimetre.
-        shift = rng.normal(0.0, strayed_px, 2) if channel != 1 else (0.0, 0.0)
-        image[channel] = cv2.remap(
-            slices[channel],
-            columns + np.float32(shift[0]),
-            rows + np.float32(shift[1]),
-            cv2.INTER_LINEAR,
-        )
+    image = _seen(rng, slices, rows, columns, parts.neighbours and rng.random() < 0.7)
     if parts.neighbours:
         _drop_neighbours(rng, image, end)
     labels = LABEL_OF[planes[REACH - 1 : REACH + 2]]
@@ -178,6 +167,28 @@ def draw_sample(rng: np.random.Generator, block: Label, parts: Parts = ALL_PARTS
     else:
         image = spoil_little(rng, image)
     return Sample(image, np.stack(carried))
+
+
+def _seen(
+    rng: np.random.Generator,
+    slices: Float32,
+    rows: Float32,
+    columns: Float32,
+    stray: bool,
+) -> Float32:
+    """The three slices at these places. Every one is a breath-hold of its own: where they ``stray``
+    the heart does not come back to the millimetre."""
+    image = np.empty((3, CROP, CROP), np.float32)
+    strayed_px = rng.uniform(0.0, 2.2) if stray else 0.0
+    for channel in range(3):
+        shift = rng.normal(0.0, strayed_px, 2) if channel != 1 else (0.0, 0.0)
+        image[channel] = cv2.remap(
+            slices[channel],
+            columns + np.float32(shift[0]),
+            rows + np.float32(shift[1]),
+            cv2.INTER_LINEAR,
+        )
+    return image
 
 
 def _draw_planes(rng: np.random.Generator, block: Label, parts: Parts) -> tuple[Label, int]:

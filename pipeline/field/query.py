@@ -73,6 +73,33 @@ def query_point(
     }
 
 
+def query_inside(
+    path: Path, point_mm: tuple[float, float, float], phase: float, fixture: str | None = None
+) -> dict[str, dict[str, Any]]:
+    """As :func:`query_point`, of a point within the grid.
+
+    Raises
+    ------
+    InputError
+        As there, and when the point lies outside.
+    """
+    answers = query_point(path, point_mm, phase, fixture)
+    if not all(answer["inside_grid"] for answer in answers.values()):
+        where = " ".join(f"{value:g}" for value in point_mm)
+        raise InputError(
+            f"--point {where}: lies outside the baked grid of {path}; give LPS millimetres of "
+            "the MR frame, near the surfaces"
+        )
+    return answers
+
+
+def limits_words(answer: Mapping[str, Any]) -> str:
+    """What a device has to follow: how fast the force changes, and how stiff the fixture is."""
+    rate = answer["force_rate_n_per_ms"]
+    changing = "" if rate is None else f", changing by {rate:.4f} N/ms"
+    return f"{changing}, {stiffness_words(answer)}"
+
+
 def stiffness_words(figures: Mapping[str, Any]) -> str:
     """A fixture's stiffness in words: by its law, as measured, and what its device can render.
 

@@ -96,6 +96,16 @@ def _is_rigid(pose):  # type: ignore[no-untyped-def]
 
 
 @_inner
+def _change2(here, left, right):  # type: ignore[no-untyped-def]
+    """Square of what a stretch's force changes by where its halves are asked in its place."""
+    total = 0.0
+    for axis in range(3, 6):
+        change = 0.5 * (left[axis] + right[axis]) - here[axis]
+        total += change * change
+    return total
+
+
+@_inner
 def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # type: ignore[no-untyped-def]
     """``tool_force`` on one line; its length, and how often the field was asked, -1: too long."""
     grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
@@ -132,11 +142,8 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
             _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
             _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
             asked += 2
-            off = 0.0
-            for axis in range(3, 6):
-                change = 0.5 * (left[axis] + right[axis]) - here[axis]
-                off += change * change
-            if (length <= longest and off <= bound_n * bound_n) or depth == HALVINGS:
+            near = _change2(here, left, right) <= bound_n * bound_n
+            if (length <= longest and near) or depth == HALVINGS:
                 _add(found, left, share * 2 / 3, pose, handle_mm)
                 _add(found, right, share * 2 / 3, pose, handle_mm)
                 _add(found, here, -share / 3, pose, handle_mm)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from pipeline.imaging.dicom_pixels import (
     whole_number,
     without_padding,
 )
+from pipeline.imaging.dicom_timing import rr_intervals_ms, times_ms
 from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.imaging.left_out import LeftOut, left_out_lines
 from pipeline.imaging.limits import FARTHEST_MM
@@ -45,8 +45,6 @@ _META_BYTES = 2048
 MOST_FRAMES = 10**6
 """No object holds more."""
 
-TRIGGER_TIMES = ("TriggerTime", "NominalCardiacTriggerDelayTime")
-"""The same moment in classic and in Enhanced objects."""
 UNASSIGNED = "Unassigned{}ConvertedAttributesSequence"
 """Where Legacy Converted Enhanced objects keep attributes without a functional group."""
 
@@ -269,7 +267,7 @@ def _frame(
         )
     try:
         timing = group("CardiacSynchronizationSequence")
-        told = _rr_ms(timing, dataset)
+        told = rr_intervals_ms(timing, dataset)
         own_rr_ms = next(iter(told.values()), None) if rr_ms is None else rr_ms
         position_mm, directions, spacing_mm = _geometry(corner, axes, spacing)
         return Frame(
@@ -278,7 +276,7 @@ def _frame(
             position_mm=position_mm,
             axes=directions,
             spacing_mm=spacing_mm,
-            times_ms=_times_ms(timing, own_rr_ms),
+            times_ms=times_ms(timing, own_rr_ms),
             rr_ms=own_rr_ms,
             series=_series_name(dataset),
             series_uid=str(dataset.get("SeriesInstanceUID", "")),
@@ -319,40 +317,6 @@ def _geometry(place: Any, axes: Any, spacing: Any) -> tuple[Float, Float, tuple[
     # Of directions written with few decimals, the nearest that are of length 1 and at right angles.
     left, _, right = np.linalg.svd(directions, full_matrices=False)
     return position_mm, left @ right, (along_row, along_column)
-
-
-def _times_ms(timing: Any, rr_ms: float | None) -> dict[str, float]:
-    """What tells the frame's moment, the most trusted first.
-
-    The trigger time comes first; where it does not tell frames apart, the actual delay or the
-    percentage of the cycle may.
-    """
-    times: dict[str, float] = {}
-    trigger = next((name for name in TRIGGER_TIMES if _given(timing, name)), None)
-    if trigger:
-        times["trigger time"] = float(timing.get(trigger))
-    if _given(timing, "ActualCardiacTriggerDelayTime"):
-        times["ActualCardiacTriggerDelayTime"] = float(timing.ActualCardiacTriggerDelayTime)
-    if _given(timing, "NominalPercentageOfCardiacPhase") and rr_ms is not None:
-        share = float(timing.NominalPercentageOfCardiacPhase) / 100
-        times["NominalPercentageOfCardiacPhase"] = share * rr_ms
-    return times
-
-
-def _given(item: Any, name: str) -> bool:
-    return item.get(name) not in (None, "")
-
-
-def _rr_ms(timing: Any, dataset: Any) -> dict[str, float]:
-    """By each attribute that tells it, the best first, of the frame or, behind that, of its whole
-    object."""
-    names = ("NominalInterval", "RRIntervalTimeNominal", "HeartRate", "CardiacRRIntervalSpecified")
-    told: dict[str, float] = {}
-    for name, item in itertools.product(names, (timing, dataset)):
-        if _given(item, name) and float(item.get(name)) > 0:
-            value = float(item.get(name))
-            told.setdefault(name, 60000 / value if name == "HeartRate" else value)
-    return told
 
 
 def _series_number(dataset: Any) -> int | None:

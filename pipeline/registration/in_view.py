@@ -1,13 +1,18 @@
-"""Whether frames cross the heart at all, wherever near its start the tracker may stand."""
+"""Whether there are frames enough, and they cross the heart at all, wherever near its start the
+tracker may stand."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.errors import InputError, UnregistrableError
+from pipeline.geometry import Float
+from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.search import Level, Search
+from pipeline.registration.settings import RegisterSettings
 
 LEAST_IN_VIEW = 0.05
 """A frame with less of its picture in blood or at its walls has too little to compare."""
@@ -17,6 +22,26 @@ _MISPLACED = (
     "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
     "ProbeToTracker, ImageToProbe), calibration, units (mm) and axes (LPS; 3D Slicer shows RAS)"
 )
+
+
+def require_frames(
+    sweeps: Sequence[TrackedSweep], phases: Sequence[Float], settings: RegisterSettings
+) -> None:
+    """Refuse fewer frames than are needed.
+
+    Raises
+    ------
+    InputError
+        When there are phases for another number of sweeps, or too few frames.
+    """
+    if len(sweeps) != len(phases):
+        raise InputError(f"{len(sweeps)} sweeps came with phases for {len(phases)}")
+    frames = sum(len(sweep.images) for sweep in sweeps)
+    if frames < settings.min_frames:
+        raise UnregistrableError(
+            f"{len(sweeps)} sweeps hold {frames} frames; registration needs {settings.min_frames} "
+            "or more (register.min_frames): add sweeps, or write `us: null` in study.yaml"
+        )
 
 
 def require_heart_in_view(level: Level, search: Search) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import InputError, StageError, UnregistrableError
+from pipeline.errors import StageError
 from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
 from pipeline.progress import Progress
@@ -22,7 +22,7 @@ from pipeline.registration.calibration import Calibration, calibrate, calibratio
 from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
 from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep
-from pipeline.registration.in_view import LEAST_IN_VIEW, require_heart_in_view
+from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
 from pipeline.registration.misplaced import by_chance
 from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
@@ -256,20 +256,6 @@ def find(
         said = f"the model lacks {', '.join(lacking)}, whose blood it takes for tissue"
         result = replace(result, reason=f"{result.reason}; {said}")
     return result
-
-
-def require_frames(
-    sweeps: Sequence[TrackedSweep], phases: Sequence[Float], settings: RegisterSettings
-) -> None:
-    """Refuse fewer frames than are needed."""
-    if len(sweeps) != len(phases):
-        raise InputError(f"{len(sweeps)} sweeps came with phases for {len(phases)}")
-    frames = sum(len(sweep.images) for sweep in sweeps)
-    if frames < settings.min_frames:
-        raise UnregistrableError(
-            f"{len(sweeps)} sweeps hold {frames} frames; registration needs {settings.min_frames} "
-            "or more (register.min_frames): add sweeps, or write `us: null` in study.yaml"
-        )
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:

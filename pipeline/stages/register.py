@@ -21,9 +21,10 @@ from pipeline.products import (
     write_table,
 )
 from pipeline.registration.clock_offset import Timing
+from pipeline.registration.in_view import require_frames
 from pipeline.registration.rhythm import read_rhythm, unordered
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.space import Registration, register, require_frames
+from pipeline.registration.space import Registration, register
 from pipeline.registration.time import detect_r_peaks, in_known_beats, median_rr_s, phases_at
 
 if TYPE_CHECKING:
