@@ -137,3 +137,40 @@ def assert_is_the_stack(stack: Stack) -> None:
     expected_mm = expected_mm + 3 * PIXEL_MM[1] * ROW_AXIS + 2 * PIXEL_MM[0] * COLUMN_AXIS
     found_mm = transform_points(cine.mr_from_index, np.array([3.0, 2.0, 3.0]))
     np.testing.assert_allclose(found_mm, expected_mm, atol=1e-6)
+
+
+def beside_the_stack(folder: Path, others: list[FileDataset]) -> Path:
+    """The good stack as series 1, and other images as series 9."""
+    write_dicom(folder, lambda data, number, phase: bool(in_series(data, 1, "short axis")))
+    for k, data in enumerate(others):
+        in_series(data, 9, "other").save_as(folder / f"other_{k:03d}.dcm")
+    return folder
+
+
+def series(slices: list[int], times_ms: list[float]) -> list[FileDataset]:
+    """Images of some slices at some moments that none of the stack's equals."""
+    found = []
+    for number in slices:
+        for k, time_ms in enumerate(times_ms):
+            data = dicom_frame(number, 0)
+            data.TriggerTime = time_ms
+            data.PixelData = (3 * pixel_value(k, number)).tobytes()
+            found.append(data)
+    return found
+
+
+def coarser(found: list[FileDataset]) -> list[FileDataset]:
+    for data in found:
+        data.PixelSpacing = [2 * value for value in data.PixelSpacing]
+    return found
+
+
+def across(slices: int, kind: str, phases: int = PHASES) -> list[FileDataset]:
+    """A cine stack in another direction."""
+    found = series(list(range(slices)), [RR_MS * k / phases for k in range(phases)])
+    for data in found:
+        number = round(float((np.array(data.ImagePositionPatient) - ORIGIN_MM) @ NORMAL) / STEP_MM)
+        data.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+        data.ImagePositionPatient = [0, 0, number * STEP_MM]
+        data.ImageType = [kind, "PRIMARY", "M"]
+    return found
