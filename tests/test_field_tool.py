@@ -75,6 +75,23 @@ def test_bound_holds_against_a_plain_sum(field, path, bound):
             assert np.linalg.norm(found.force_n) <= FIXTURES[name].f_max_n
 
 
+@pytest.mark.parametrize("bound", [0.05, 0.01])
+@pytest.mark.parametrize("length_mm", [1.0, 2.0, 3.0, 5.0])
+def test_bound_holds_for_short_needles_across_a_medial_axis(field, bound, length_mm):
+    """About the middle of the ball, where the force turns about within a spacing of the grid."""
+    rng = np.random.default_rng(3)
+    tool = Needle(shape="needle", length_mm=length_mm)
+    turns = Rotation.random(400, random_state=4).as_matrix()
+    starts = rng.uniform(-4, 4, (400, 3)) - turns[:, :, 2] * length_mm / 2
+    along_mm = (np.arange(2000) + 0.5) / 2000 * length_mm
+    for turn, start in zip(turns, starts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, start
+        found = field.tool_force(tool, pose, 0.05, "guide", bound)
+        points = start + along_mm[:, None] * turn[:, 2]
+        assert np.linalg.norm(found.force_n - field.force_n(points, 0.05, "guide").mean(0)) <= bound
+
+
 def test_a_path_is_no_tool(field):
     with pytest.raises(InputError, match=r"read_tool\(path\), got 'needle\.yaml'"):
         field.tool_force("needle.yaml", np.eye(4), 0.0)

@@ -18,6 +18,9 @@ _asked, _inner = kernels.asked, kernels.inner
 
 HALVINGS = 12
 """A stretch of a tool is halved no more often than this."""
+LARGE, FINER, STRICTER = 0.2, 0.125, 1.0 / 3.0
+"""A stretch that is more than this share of its tool has few beside it to make up for its error: it
+is so much shorter, and may change by so much less, before it is believed."""
 LONGEST = 20.0
 """Times the grid's diagonal: a tool's line that is longer is in another unit."""
 
@@ -142,8 +145,11 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
             _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
             _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
             asked += 2
-            near = _change2(here, left, right) <= bound_n * bound_n
-            if (length <= longest and near) or depth == HALVINGS:
+            fine, bound = longest, bound_n
+            if share > LARGE:
+                fine, bound = FINER * longest, STRICTER * bound_n
+            near = _change2(here, left, right) <= bound * bound
+            if (length <= fine and near) or depth == HALVINGS:
                 _add(found, left, share * 2 / 3, pose, handle_mm)
                 _add(found, right, share * 2 / 3, pose, handle_mm)
                 _add(found, here, -share / 3, pose, handle_mm)

@@ -1873,6 +1873,12 @@ typedef struct {
 
 enum { BF__HALVINGS = 12, BF__LONGEST = 20 };
 
+/* A stretch that is more than this share of its tool has few beside it to make up for its error: it is so
+ * much shorter, and may change by so much less, before it is believed. */
+#define BF__LARGE 0.2
+#define BF__FINER 0.125
+#define BF__STRICTER (1.0 / 3.0)
+
 static double bf__length(const bf_tool *tool, int piece)
 {
     const double *a = tool->points_mm + 3 * (size_t)piece;
@@ -1941,7 +1947,7 @@ static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, doub
                         const bf__feel *middle, int depth)
 {
     bf__feel left, right;
-    double way = 0.5 * length_mm, reach, off = 0;
+    double way = 0.5 * length_mm, reach, off = 0, fine_mm = walk->longest_mm, bound_n = walk->bound_n;
     int axis;
     /* Without a number no bound is ever kept, and a tick would be over long before the halving. */
     if (!walk->sound) return;
@@ -1959,7 +1965,11 @@ static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, doub
     }
     /* The midpoint rule errs by about four thirds of the change that halving makes, Simpson's
      * combination of both by far less: the change itself is a bound with room to spare. */
-    if ((length_mm <= walk->longest_mm && off <= walk->bound_n * walk->bound_n) || depth == BF__HALVINGS) {
+    if (share > BF__LARGE) {
+        fine_mm *= BF__FINER;
+        bound_n *= BF__STRICTER;
+    }
+    if ((length_mm <= fine_mm && off <= bound_n * bound_n) || depth == BF__HALVINGS) {
         bf__add(walk, &left, share * 2 / 3);
         bf__add(walk, &right, share * 2 / 3);
         bf__add(walk, middle, -share / 3);
