@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.console import in_one_line
+from pipeline.console import in_one_line, plain
 from pipeline.errors import InputError
 from pipeline.publish import write_whole
 from pipeline.summary import remarks
@@ -211,6 +211,8 @@ def write_table(path: Path, outcomes: Sequence[Outcome]) -> InputError | None:
 
 
 def _as_text(value: Any) -> Any:
-    """A cell that spreadsheets show: they would run a folder's name that begins as a formula."""
-    begins = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
-    return f"'{value}" if begins else value
+    """A cell that spreadsheets and terminals show: they would run a folder's name that begins as a
+    formula, or obey what is in it."""
+    if not isinstance(value, str):
+        return value
+    return plain(f"'{value}" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else value)

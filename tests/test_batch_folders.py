@@ -204,6 +204,15 @@ def test_a_name_of_two_lines_forges_no_row(
     assert "new\\nline done" in printed.err
 
 
+def test_a_name_that_commands_a_terminal_is_shown_in_the_table_by_its_numbers(
+    studies: Path,
+) -> None:
+    make_study(studies / "new\x1b[2Jname", "patient_id: p2\n")
+    assert batch(studies) == 0
+    assert "\x1b" not in (studies.parent / "out" / "batch.csv").read_text()
+    assert "new\\x1b[2Jname" in rows_of(studies.parent / "out")
+
+
 def test_the_same_images_under_two_names_are_told(studies: Path) -> None:
     for name, image in (("x", "same"), ("y", "same"), ("z", "other")):
         make_study(studies / name, image=image)

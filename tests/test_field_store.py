@@ -16,6 +16,7 @@ from pipeline.field import ForceField
 from pipeline.field.files import read_metadata
 from pipeline.field.manifest import canonical_manifest, write_manifest
 from pipeline.field.potential import offence, potential
+from pipeline.field.query import query_point
 from pipeline.field.verify import verify_field
 
 
@@ -306,6 +307,21 @@ def test_a_description_that_is_none_is_told_with_its_file(copy, key, value, word
     (copy / "zarr.json").write_text(json.dumps(description))
     with pytest.raises(InputError, match=rf"zarr\.json: beatfield.*{words}"):
         read_metadata(copy)
+
+
+@pytest.mark.parametrize("text", ["[]", "5", '{"shape": []}', "[" * 100_000])
+def test_an_array_sealed_with_no_description_of_its_own_is_told(copy, text):
+    (copy / "distance" / "ball" / "zarr.json").write_text(text)
+    (copy / "manifest.json").unlink()
+    write_manifest(copy)
+    with pytest.raises(InputError, match=r"distance/ball/zarr\.json: (is no|shape is|cannot be)"):
+        verify_field(copy)
+
+
+def test_a_certificate_of_odd_content_keeps_no_question_from_its_answer(copy):
+    edit(copy, lambda told: told.update(accuracy={"fixtures": [1]}))
+    answers = query_point(copy, (14.0, 2.0, 1.0), 0.3)
+    assert [one["stiffness_measured_n_per_m"] for one in answers.values()] == [None] * len(FIXTURES)
 
 
 def test_opening_refuses_what_it_can_see_at_no_cost(copy):

@@ -86,6 +86,14 @@ def verify_field(path: Path) -> Report:
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give a field.zarr that bake wrote")
     files = _read_manifest(path / MANIFEST)
+    try:
+        return _verified(path, files)
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        # Of a manifest and descriptions that agree, and were written by something else.
+        raise InputError(f"{path}: holds what no field does ({error!r}); bake it again") from error
+
+
+def _verified(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Report:
     _refuse(path, list(_file_problems(path, files)))
     metadata = read_metadata(path)
     _refuse(path, [problem for name in metadata.arrays for problem in _array(path, name, metadata)])
