@@ -94,7 +94,7 @@ def read_dicom_study(
     for path in images:
         try:
             number, found = _read_object(path, rr_ms, without_series)
-        except InputError:
+        except (InputError, MemoryError):
             raise
         except Exception as error:  # pydicom raises many kinds where a value is asked for
             raise _not_understood(str(path), error) from error
@@ -157,13 +157,19 @@ def _require_series(asked: Sequence[int], there: set[int | None], where: str) ->
 
 
 def _read(path: Path) -> Any:
-    with path.open("rb") as file:
+    try:
+        with path.open("rb") as file:
+            deflated = DEFLATED in file.read(_META_BYTES)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give yourself the right to, or take it out"
+        ) from error
+    if deflated:
         # Of a megabyte that unpacks to gigabytes the library makes gigabytes.
-        if DEFLATED in file.read(_META_BYTES):
-            raise InputError(
-                f"{path}: is deflated as a whole (transfer syntax {DEFLATED.decode()}); export it "
-                "uncompressed, or with its pixels alone compressed"
-            )
+        raise InputError(
+            f"{path}: is deflated as a whole (transfer syntax {DEFLATED.decode()}); export it "
+            "uncompressed, or with its pixels alone compressed"
+        )
     try:
         dataset = pydicom.dcmread(path, force=is_bare(path))
         if "TransferSyntaxUID" not in dataset.file_meta:
@@ -174,6 +180,8 @@ def _read(path: Path) -> Any:
                 else pydicom.uid.ExplicitVRLittleEndian
             )
         return dataset
+    except MemoryError:
+        raise
     # What the library raises of damaged files is of many kinds.
     except Exception as error:
         raise InputError(
