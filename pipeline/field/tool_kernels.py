@@ -109,6 +109,14 @@ def _change2(here, left, right):  # type: ignore[no-untyped-def]
 
 
 @_inner
+def _is_enough(share, length, longest, change2, bound_n):  # type: ignore[no-untyped-def]
+    """Whether a stretch is so short, and changes by so little, that it need not be divided."""
+    if share > LARGE:
+        longest, bound_n = FINER * longest, STRICTER * bound_n
+    return length <= longest and change2 <= bound_n * bound_n
+
+
+@_inner
 def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # type: ignore[no-untyped-def]
     """``tool_force`` on one line; its length, and how often the field was asked, -1: too long."""
     grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
@@ -145,11 +153,8 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
             _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
             _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
             asked += 2
-            fine, bound = longest, bound_n
-            if share > LARGE:
-                fine, bound = FINER * longest, STRICTER * bound_n
-            near = _change2(here, left, right) <= bound * bound
-            if (length <= fine and near) or depth == HALVINGS:
+            change2 = _change2(here, left, right)
+            if depth == HALVINGS or _is_enough(share, length, longest, change2, bound_n):
                 _add(found, left, share * 2 / 3, pose, handle_mm)
                 _add(found, right, share * 2 / 3, pose, handle_mm)
                 _add(found, here, -share / 3, pose, handle_mm)
