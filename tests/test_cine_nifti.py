@@ -118,7 +118,10 @@ def test_axes_in_another_order_are_named(tmp_path: Path, shape: tuple[int, ...])
 
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_voxels_in_metres_or_micrometres_are_named(tmp_path: Path, unit: float) -> None:
-    nifti_cine(tmp_path / "cine.nii", np.diag([1.5 * unit, 1.5 * unit, 8 * unit, 1]))
+    affine = np.diag([1.5 * unit, 1.5 * unit, 8 * unit, 1])
+    # As far from the scanner's middle as a heart lies.
+    affine[:3, 3] = unit * np.array([-180.0, -220.0, 90.0])
+    nifti_cine(tmp_path / "cine.nii", affine)
     with pytest.raises(InputError, match=r"its voxels measure .* write its affine in millimetres"):
         read_nifti_cine(tmp_path / "cine.nii", None)
 

@@ -10,8 +10,8 @@ MOST_VALUES = 1 << 30
 MOST_PIXELS = 1 << 24
 """Of one image of a slice: 4096 x 4096."""
 
-FARTHEST_MM = 1e5
-"""From the scanner's origin: no bore is as long."""
+FARTHEST_MM = 1e6
+"""From the scanner's origin: no bore is as long, even told in micrometres."""
 
 
 def require_bounded(values: int, where: str, most: int = MOST_VALUES) -> None:
