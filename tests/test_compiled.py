@@ -98,3 +98,17 @@ def test_a_folder_that_may_not_be_written_keeps_sources_apart_too(tmp_path, monk
         place = Path(config.CACHE_DIR)
     assert place.name.startswith("numba-")
     assert place.parent == (folder / "__pycache__" if writable else tmp_path / "mine" / "beatfield")
+
+
+def test_the_phantom_compiles_where_its_own_place_may_not_be_written(monkeypatch):
+    """Installed by another user, say; what it compiles is for this run alone then."""
+
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied")
+
+    beside = Path(phantom.__file__).parent / "__pycache__"
+    assert phantom._place.__wrapped__() == beside
+    monkeypatch.setattr(phantom.tempfile, "TemporaryFile", refuse)
+    place = phantom._place.__wrapped__()
+    assert place.is_dir()
+    assert place != beside
