@@ -35,6 +35,7 @@ from hypothesis import strategies as st
 from pydicom.dataset import FileDataset
 from pydicom.uid import (
     BasicTextSRStorage,
+    MRImageStorage,
     SecondaryCaptureImageStorage,
 )
 
@@ -226,6 +227,96 @@ def test_reports_and_screen_captures_are_left_out_and_named(
     other_object(sop_class).save_as(tmp_path / "none" / "only.dcm")
     with pytest.raises(InputError, match="holds no MR image"):
         read_dicom_cine(tmp_path / "none")
+
+
+def emptied(*names: str, sop_class: str = SecondaryCaptureImageStorage) -> FileDataset:
+    """A picture of the screen, as a program that makes files anonymous leaves it."""
+    data = dicom_frame(0, 0)
+    data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = sop_class
+    data.Modality, data.ImageType = "OT", ["DERIVED", "SECONDARY"]
+    for name in names:
+        setattr(data, name, None)
+    return data
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        emptied("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"),
+        emptied("PixelSpacing"),
+        emptied("ImagePositionPatient", sop_class=MRImageStorage),
+    ],
+)
+def test_pictures_whose_place_was_emptied_are_left_out(
+    tmp_path: Path, picture: FileDataset
+) -> None:
+    stack = read_dicom_cine(mixed(tmp_path, [picture]))
+    assert_is_the_stack(stack)
+    (line,) = stack.left_out
+    assert "1 object" in line
+    assert "without a place in space" in line
+
+
+def test_a_derived_series_gives_the_slice_that_the_originals_lack_alone(tmp_path: Path) -> None:
+    def original(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "cine")
+        return number != SLICES - 1
+
+    write_dicom(tmp_path, original)
+    for k, data in enumerate(of_type("DERIVED", "PRIMARY", "M", "NORM")):
+        data.save_as(tmp_path / f"0{k:03d}_other.dcm")
+    stack = read_dicom_cine(tmp_path)
+    expected = np.stack(
+        [
+            [(2 if z == SLICES - 1 else 1) * pixel_value(phase, z) for z in range(SLICES)]
+            for phase in range(PHASES)
+        ]
+    )
+    np.testing.assert_array_equal(stack.cine.intensity, expected)
+    (line,) = stack.left_out
+    assert f"{PHASES * (SLICES - 1)} images" in line
+    assert "derived images, slices that the stack has already" in line
+
+
+def beats_on(data: FileDataset, later_ms: float) -> None:
+    data.TriggerTime = float(data.TriggerTime) + later_ms
+
+
+@pytest.mark.parametrize(
+    ("later_ms", "words"),
+    [
+        (-20.0, "-20 to 620 ms do not fit .*times of 0 and more"),
+        (RR_MS, "800 to 1440 ms do not fit .*from an earlier R peak: give times since the last"),
+    ],
+)
+def test_times_from_another_r_peak_are_told_and_no_coarser_stack_takes_their_place(
+    tmp_path: Path, later_ms: float, words: str
+) -> None:
+    def later(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "cine")
+        beats_on(data, later_ms)
+        return True
+
+    write_dicom(tmp_path, later)
+    coarse = [resized(in_series(dicom_frame(*one), 9, "tagged"), 2) for one in ALL_FRAMES]
+    for k, data in enumerate(coarse[: 3 * PHASES]):
+        data.save_as(tmp_path / f"0{k:03d}_other.dcm")
+    with pytest.raises(InputError, match=words):
+        read_dicom_cine(tmp_path)
+
+
+def test_two_echoes_in_one_series_are_told_as_that(tmp_path: Path) -> None:
+    def numbered(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "cine")
+        return True
+
+    write_dicom(tmp_path, numbered)
+    for phase in range(PHASES):
+        data = in_series(dicom_frame(1, phase), 1, "cine")
+        data.PixelData = (2 * data.pixel_array).tobytes()
+        data.save_as(tmp_path / f"0{phase:03d}_other.dcm")
+    with pytest.raises(InputError, match=r'both are of series 1 "cine".*take the files of one out'):
+        read_dicom_cine(tmp_path)
 
 
 def test_derived_images_alone_are_a_stack(tmp_path: Path) -> None:

@@ -134,3 +134,47 @@ def test_bright_places_within_an_image_are_no_padding(tmp_path: Path) -> None:
 
     write_dicom(tmp_path, change)
     assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("signed", "bits", "value", "fits"),
+    [
+        (False, 12, 4096, False),
+        (False, 12, 4095, True),
+        (True, 12, 2048, True),
+        (True, 12, -2049, False),
+        (True, 12, -2048, True),
+        (False, 14, 4096, True),
+    ],
+)
+def test_values_beyond_the_bits_that_the_header_tells_are_refused(
+    tmp_path: Path, signed: bool, bits: int, value: int, fits: bool
+) -> None:
+    """A value of 12 bits reads the same whatever its sign bits say; more would lose its top."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        stored = pixel_value(phase, number).astype(np.int16)
+        stored[-1, -1] = value
+        data.BitsStored, data.HighBit, data.PixelRepresentation = bits, bits - 1, int(signed)
+        data.PixelData = stored.tobytes()
+        return True
+
+    write_dicom(tmp_path, change)
+    if fits:
+        read_dicom_cine(tmp_path)
+    else:
+        with pytest.raises(InputError, match=rf"values beyond its {bits} bits .*export it anew"):
+            read_dicom_cine(tmp_path)
+
+
+def test_overlays_in_the_upper_bits_are_no_values(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        stored = pixel_value(phase, number)
+        stored[0, :3] |= 1 << 12
+        data.BitsStored, data.HighBit = 12, 11
+        data.PixelData = stored.tobytes()
+        data.add_new((0x6000, 0x0102), "US", 12)
+        return True
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path))

@@ -221,7 +221,7 @@ def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[F
         if tie := _tie(one, name):
             raise InputError(
                 f"{where}: {tie[0].where} and {tie[1].where} show the same slice at the same "
-                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(one, name)}"
+                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(one, name, tie)}"
             )
     return ordered, name
 
@@ -244,9 +244,14 @@ def _shared_time_names(slices: Sequence[Sequence[Frame]], where: str) -> list[st
     return names
 
 
-def _remedy(one: Sequence[Frame], name: str) -> str:
-    """What to do about frames of a slice that have the same time."""
+def _remedy(one: Sequence[Frame], name: str, tie: tuple[Frame, Frame]) -> str:
+    """What to do about frames of a slice of which two have the same time."""
     if len({frame.times_ms[name] for frame in one}) > 1:
+        if tie[0].series_uid == tie[1].series_uid:
+            return (
+                f"both are of {tie[0].series}, as of two echoes, two image types or a slice that "
+                "was taken twice: take the files of one out"
+            )
         return "keep one series a slice"
     return (
         "its times do not tell its phases apart: export them with TriggerTime (0018,1060), or "

@@ -206,7 +206,11 @@ def _other_object(dataset: Any) -> str | None:
         return f"{name}, of modality {modality}"
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"
-    placed = "ImagePositionPatient" in dataset or "PerFrameFunctionalGroupsSequence" in dataset
+    magnetic = sop_class in MR_CLASSES
+    # Programs that make files anonymous may leave the attribute, and empty it.
+    placed = bool(dataset.get("ImagePositionPatient"))
+    placed = placed and (magnetic or bool(dataset.get("PixelSpacing")))
+    placed = placed or (magnetic and "PerFrameFunctionalGroupsSequence" in dataset)
     together = int(dataset.get("NumberOfFrames", 1) or 1)
     if together > 1 and "PerFrameFunctionalGroupsSequence" not in dataset:
         placed = False

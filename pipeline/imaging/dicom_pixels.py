@@ -31,7 +31,34 @@ def stored_pixels(dataset: Any, path: Path) -> Any:
             ) from error
     if stored.size != frames * dataset.Rows * dataset.Columns:
         raise InputError(f"{path}: is in colour; the cine needs grey images")
+    _require_bits_as_told(dataset, path)
     return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
+
+
+def _require_bits_as_told(dataset: Any, path: Path) -> None:
+    """Refuse values larger than the header says, whose uppermost bits readers cut off.
+
+    What was very bright would be dark. Before overlays had an attribute of their own they were kept
+    in these bits (DICOM PS3.5, 8.1.1), which the header then tells.
+    """
+    bits = int(dataset.BitsStored)
+    overlays = any(
+        dataset.get((group, 0x0102)) and (group, 0x3000) not in dataset
+        for group in range(0x6000, 0x6020, 2)
+    )
+    if int(dataset.BitsAllocated) != 16 or bits >= 16 or overlays or _syntax(dataset).is_compressed:
+        return
+    order = ">" if _syntax(dataset) == pydicom.uid.ExplicitVRBigEndian else "<"
+    words = np.frombuffer(dataset.PixelData, f"{order}u2")
+    beyond = words >> bits
+    if int(dataset.get("PixelRepresentation", 0)):
+        negative = (words >> (bits - 1)) & 1
+        beyond = np.where(negative & (beyond == (1 << (16 - bits)) - 1), 0, beyond)
+    if beyond.any():
+        raise InputError(
+            f"{path}: has values beyond its {bits} bits (BitsStored (0028,0101)), such as "
+            f"{words[beyond > 0][0]}; export it anew, with as many bits as its values have"
+        )
 
 
 def _syntax(dataset: Any) -> Any:

@@ -164,7 +164,8 @@ def span_beat(frames: Sequence[Frame]) -> bool:
 def are_in_one_beat(frames: Sequence[Frame]) -> bool:
     """Whether most slices' times lie within about one RR interval, as those of images in real time
     do not."""
-    return float(np.median([max(map(_beats, one)) for one in by_slice(frames)])) < MANY_BEATS
+    beats = [[_beats(frame) for frame in one] for one in by_slice(frames)]
+    return float(np.median([max(one) - min(one) for one in beats])) < MANY_BEATS
 
 
 def _beats(frame: Frame) -> float:

@@ -68,11 +68,18 @@ def _require_within_beats(
     outside = ((phases < 0) | (phases >= 1)).any(axis=1)
     if outside.any():
         number = int(outside.argmax())
+        first_ms, last_ms = trigger_times_ms[number].min(), trigger_times_ms[number].max()
+        remedy = "correct them, or give cine.rr_ms in study.yaml"
+        if first_ms < 0:
+            remedy = "they count from the R peak: give times of 0 and more"
+        elif first_ms >= 0.5 * rr_ms[number] and last_ms - first_ms < rr_ms[number]:
+            remedy = (
+                "they seem to count from an earlier R peak: give times since the last one; or give "
+                "cine.rr_ms in study.yaml, if the beat is as long as that"
+            )
         raise InputError(
-            f"{where}: trigger times from {trigger_times_ms[number].min():g} to "
-            f"{trigger_times_ms[number].max():g} ms do not fit in an RR interval of "
-            f"{rr_ms[number]:g} ms (slice {numbers[number]}); correct them, or give cine.rr_ms "
-            "in study.yaml"
+            f"{where}: trigger times from {first_ms:g} to {last_ms:g} ms do not fit in an RR "
+            f"interval of {rr_ms[number]:g} ms (slice {numbers[number]}); {remedy}"
         )
 
 

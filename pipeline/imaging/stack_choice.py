@@ -71,7 +71,13 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
         if reason:
             left_out += _spared(others, reason)
         elif _joins(stack[0], others[0]):
-            stack = stack + others
+            slices_mm, normal = slice_positions(stack), stack[0].normal
+            twice = [one for one in others if _covered([one], normal, slices_mm)]
+            left_out += _spared(
+                twice, f"{others[0].kind} images, slices that the stack has already"
+            )
+            known = {id(one) for one in twice}
+            stack = stack + [one for one in others if id(one) not in known]
         else:
             _refuse(stack[0], others[0], where)
     return stack, left_out
@@ -275,16 +281,17 @@ def _refuse(first: Frame, other: Frame, where: str) -> None:
             f"slices have different matrices: {one} has {first.pixels.shape}, {two} has "
             f"{other.pixels.shape} (rows, columns); give one stack of one matrix"
         )
-    elif not np.allclose(other.spacing_mm, first.spacing_mm, rtol=1e-3):
-        what = (
-            f"slices have different pixel spacing: {one} has {first.spacing_mm} mm, {two} has "
-            f"{other.spacing_mm} mm; give one stack of one spacing"
-        )
     elif not have_same_axes(first, other):
         what = (
             f"slices are turned in their plane: rows and columns of {two} run along "
             f"{other.axes.round(3).tolist()}, those of {one} along "
             f"{first.axes.round(3).tolist()}; give one stack of one direction"
+        )
+    elif not np.allclose(other.spacing_mm, first.spacing_mm, rtol=1e-3):
+        what = (
+            f"slices have different pixel spacing: {one} has {first.spacing_mm[::-1]} mm, {two} "
+            f"has {other.spacing_mm[::-1]} mm (from row to row, from column to column); give one "
+            "stack of one spacing"
         )
     else:
         what = (
