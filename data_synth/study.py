@@ -52,6 +52,7 @@ def write_study(
         When the folder exists or cannot be written.
     """
     require_free(folder, overwrite)
+    _require_text(folder.absolute())
     with publishing(folder) as partial:
         study = simulate_study(settings, progress, done=65)
         _write_recordings(partial, study)
@@ -60,6 +61,15 @@ def write_study(
             from data_synth.preview import write_preview
 
             write_preview(partial / PREVIEW, study)
+
+
+def _require_text(folder: Path) -> None:
+    """The library that writes images ends the program at a name that is none."""
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError as error:
+        told = os.fsencode(folder).decode(errors="backslashreplace")
+        raise SynthError(f"{told}: is no UTF-8 text; choose another folder") from error
 
 
 def require_free(folder: Path, overwrite: bool) -> None:

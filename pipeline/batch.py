@@ -246,7 +246,8 @@ class _Running:
     def _call(self, plan: Plan) -> Ended:
         if self._children.stopped:
             return self._not_begun(plan)
-        command = [sys.executable, "-m", "pipeline.batch_member", "run", str(plan.folder)]
+        # Not from the folder in which the user happens to be.
+        command = [sys.executable, "-P", "-m", "pipeline.batch_member", "run", str(plan.folder)]
         command += self._options
         log = self._out / LOGS / _log_name(plan.name)
         before = record_stamp(products_of(self._out, plan))

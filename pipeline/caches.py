@@ -14,6 +14,8 @@ from pipeline.errors import InputError
 PLACE = "NUMBA_CACHE_DIR"
 """By which the compiler is told of a place; processes begun by this one hear of it too."""
 
+_SOME_BYTES = 65536
+
 
 def provide_place() -> None:
     """Give the compiler a place where it would find none, and would end the program for it.
@@ -21,9 +23,16 @@ def provide_place() -> None:
     Raises
     ------
     InputError
-        When not even temporary files may be written.
+        When not even temporary files may be written, or the user's own place may not.
     """
-    if os.environ.get(PLACE) or os.access(Path(__file__).parent, os.W_OK):
+    if given := os.environ.get(PLACE):
+        if not is_writable(Path(given)):
+            raise InputError(
+                f"{given}: {PLACE} names it for compiled code, and it cannot be written; name a "
+                "folder that you may write in, or unset that"
+            )
+        return
+    if os.access(Path(__file__).parent, os.W_OK):
         return
     own = own_caches()
     if own is None or not is_writable(own):
@@ -31,10 +40,13 @@ def provide_place() -> None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, which is made if need be."""
+    """Whether files can be made in a folder, which is made if need be, and something in them."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        with tempfile.TemporaryFile(dir=folder) as file:
+            # A full disk still takes an empty one.
+            file.write(bytes(_SOME_BYTES))
+            file.flush()
     except OSError:
         return False
     return True

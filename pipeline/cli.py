@@ -345,8 +345,9 @@ def synth(
 
     `beatfield synth --help` lists all options.
     """
-    # A process of its own: the pipeline does not know the code that makes its test data.
-    with subprocess.Popen([sys.executable, "-m", "data_synth", *arguments]) as child:
+    # A process of its own: the pipeline does not know the code that makes its test data. Nor does
+    # it look for it in the folder in which the user happens to be (-P).
+    with subprocess.Popen([sys.executable, "-P", "-m", "data_synth", *arguments]) as child:
         try:
             code = child.wait()
         except KeyboardInterrupt:

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Integer, Surface
 from pipeline.ply import require_sound_ply
+from pipeline.regular_files import require_text_name
 
 MESH_ENDINGS = (".vtp", ".stl", ".ply")
 
@@ -53,6 +54,7 @@ def read_mesh(path: Path) -> Surface:
     """
     import pyvista
 
+    require_text_name(path)
     require_whole(path)
     try:
         mesh = pyvista.read(path)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
+from pipeline.regular_files import require_text_name
 
 PARTIAL = ".partial-"
 
@@ -188,8 +189,9 @@ def locked(folder: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        When another run is at work in the folder, or it cannot be written.
+        When another run is at work in the folder, it cannot be written, or its name is no text.
     """
+    require_text_name(folder.absolute())
     with readable_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         handle = (folder / ".lock").open("w")

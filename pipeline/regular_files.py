@@ -24,3 +24,19 @@ def require_no_device(path: Path) -> None:
                 f"{path}: is a pipe, a socket or a device, a file is needed; put the file itself "
                 "there, or take it out"
             )
+
+
+def require_text_name(path: Path) -> None:
+    """Refuse a path that is no text: libraries that read images end the program at its sight.
+
+    Raises
+    ------
+    InputError
+        When a part of it is no UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{path}: its name is no UTF-8 text; rename that file or folder"
+        ) from error

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
-from pipeline.regular_files import require_no_device
+from pipeline.regular_files import require_no_device, require_text_name
 from pipeline.sealing import sha256_of
 from pipeline.study_files import files_below, record_files, require_signals, sweep_files
 from pipeline.study_folders import (
@@ -146,6 +146,7 @@ def open_study(folder: Path) -> Study:
         folder = inside[0]
     # A link has a name of its own, and many may lead to folders of one name.
     called, folder = folder.name if folder.is_symlink() else "", folder.resolve()
+    require_text_name(folder)
     _require_name_of_description(folder)
     described = folder / "study.yaml"
     require_no_device(described)

@@ -14,7 +14,9 @@ def stand_in(folder: Path, program: str) -> str:
     """
     script, wrapper = folder / "program.py", folder / "python"
     script.write_text(program)
-    wrapper.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n')
+    # It is to be told not to look for modules where the user happens to be.
+    only = '[ "$1" = -P ] || exit 64; shift'
+    wrapper.write_text(f'#!/bin/sh\n{only}\nexec "{sys.executable}" "{script}" "$@"\n')
     wrapper.chmod(0o755)
     return str(wrapper)
 

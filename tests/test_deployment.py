@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -12,13 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_synth.errors import SynthError
+from data_synth.settings import PhantomSettings
+from data_synth.study import write_study
 from pipeline import caches, compiled
 from pipeline.batch_table import outcome_of, write_table
 from pipeline.console import BatchConsole, Console, plain, show
 from pipeline.ending import guarded
 from pipeline.errors import InputError
+from pipeline.imaging.metaimage import read_metaimage
+from pipeline.meshes import read_mesh
 from pipeline.publish import locked
 from pipeline.report import pictures
+from pipeline.study import open_study
 
 ROOT = Path(__file__).parents[1]
 BEATFIELD = [sys.executable, "-m", "pipeline"]
@@ -210,3 +217,54 @@ def test_make_takes_names_with_spaces_and_all_that_a_shell_obeys(tmp_path: Path)
         assert '"$STUDY" --out "$OUT"' in said
     assert str(study) not in made("demo", f"STUDY={study}")
     assert 'mkdir -p "$OUT"' in made("demo", f"OUT={out}")
+
+
+def test_a_place_for_compiled_code_that_cannot_be_written_is_named(tmp_path, monkeypatch):
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setenv(caches.PLACE, str(tmp_path / "a file" / "numba"))
+    with pytest.raises(InputError, match=rf"a file/numba: {caches.PLACE} names it .*unset that"):
+        caches.provide_place()
+    monkeypatch.setenv(caches.PLACE, str(tmp_path / "numba"))
+    caches.provide_place()
+    assert (tmp_path / "numba").is_dir()
+
+
+def test_a_place_that_takes_empty_files_alone_is_none(tmp_path):
+    """As a full disk does; here by the limit of a file's length."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    assert caches.is_writable(tmp_path)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        writable = caches.is_writable(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not writable
+
+
+def test_code_in_the_folder_where_the_user_is_is_not_run(tmp_path):
+    for name in ("random", "pipeline", "data_synth", "yaml"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('mine')\n")
+    command = [sys.executable, "-P", "-m", "pipeline", "synth", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "mine" not in done.stdout + done.stderr
+    assert done.returncode == 0
+    assert "--seed" in done.stdout
+
+
+def test_names_that_are_no_text_are_refused_before_a_library_ends_the_program(tmp_path):
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/L\xfctin"))
+    (odd / "cine").mkdir(parents=True)
+    (odd / "cine" / "one.nii").write_bytes(b"")
+    (odd / "us.mha").write_bytes(b"")
+    for refused in (open_study, locked_once, read_metaimage, read_mesh):
+        path = odd if refused in (open_study, locked_once) else odd / "us.mha"
+        with pytest.raises(InputError, match="is no UTF-8 text; rename"):
+            refused(path)
+    with pytest.raises(SynthError, match=r"L.xfctin/new: is no UTF-8 text"):
+        write_study(odd / "new", PhantomSettings())
+    assert not (odd / "new").exists()
+
+
+def locked_once(folder):
+    with locked(folder):
+        pass

@@ -88,7 +88,8 @@ def draw_scenes(
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         _hand_over(work / "scene.npz", moments, rotation, fans)
-        command = [sys.executable, "-m", "data_synth.preview.scene", str(work)]
+        # Not from the folder in which the user happens to be.
+        command = [sys.executable, "-P", "-m", "data_synth.preview.scene", str(work)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=TIME_LIMIT_S, check=False)
         except subprocess.TimeoutExpired:

@@ -14,15 +14,20 @@ from data_synth.training.command import (
     add_arguments,
     count,
     mean_losses,
+    need_extra,
     say_pool,
     whole_number,
     write,
 )
-from data_synth.training.loop import draw_from, mean_of, train
-from data_synth.training.network import WIDTHS, HeartNet, take_over
-from data_synth.training.pool import PoolSettings, fill_pool
-from data_synth.training.render import Parts
-from data_synth.training.runs import TrainSettings, has_ended, load_weights
+
+try:
+    from data_synth.training.loop import draw_from, mean_of, train
+    from data_synth.training.network import WIDTHS, HeartNet, take_over
+    from data_synth.training.pool import PoolSettings, fill_pool
+    from data_synth.training.render import Parts
+    from data_synth.training.runs import TrainSettings, has_ended, load_weights
+except ModuleNotFoundError as error:
+    need_extra(error)
 
 
 def main(arguments: list[str] | None = None) -> int:

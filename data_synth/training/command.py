@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -34,6 +35,17 @@ def add_arguments(
     )
     add("--seed", type=whole_number, default=0)
     add("--pool-only", action="store_true", help="fill the pool and stop")
+
+
+def need_extra(error: ModuleNotFoundError) -> NoReturn:
+    """End the program where what only training needs is not installed."""
+    if error.name not in ("torch", "onnx"):
+        raise error
+    sys.stderr.write(
+        f"error: training needs {error.name}, which is not installed: pip install "
+        "'beatfield[train]', or `make train`, which does that\n"
+    )
+    sys.exit(2)
 
 
 def whole_number(text: str) -> int:

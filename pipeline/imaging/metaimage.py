@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.imaging.limits import require_bounded
+from pipeline.regular_files import require_text_name
 
 # Bytes of one value, by its name in a MetaImage header; others are the library's to check.
 _VALUE_BYTES = {
@@ -45,6 +46,7 @@ def read_metaimage(path: Path) -> tuple[Any, Fields]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; a sweep is a .mha, or a .mhd with its raw file")
+    require_text_name(path)
     _require_all_bytes(path)
     reader = sitk.ImageFileReader()
     reader.SetImageIO("MetaImageIO")

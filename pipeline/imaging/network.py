@@ -46,7 +46,7 @@ def load_network() -> Any:
     except cv2.error as error:
         raise StageError(
             f"{WEIGHTS}: the segmentation weights cannot be read ({error}); install the package "
-            "again, or make them anew with `python -m data_synth.training`"
+            "again, with an OpenCV of version 5 or later"
         ) from error
 
 

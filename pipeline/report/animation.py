@@ -53,7 +53,8 @@ def beating_surfaces(surfaces: Mapping[str, MovingSurface], rr_s: float) -> byte
             _hand_over(work / "surfaces.npz", surfaces)
         except OSError as error:
             raise _no_room() from error
-        command = [sys.executable, "-m", "pipeline.report.animation", str(work)]
+        # Not from the folder in which the user happens to be.
+        command = [sys.executable, "-P", "-m", "pipeline.report.animation", str(work)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=TIME_LIMIT_S, check=False)
         except subprocess.TimeoutExpired:

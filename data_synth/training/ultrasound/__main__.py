@@ -6,10 +6,21 @@ import argparse
 import sys
 
 from data_synth.errors import SynthError
-from data_synth.training.command import add_arguments, count, mean_losses, say_pool, write
-from data_synth.training.runs import TrainSettings, has_ended
-from data_synth.training.ultrasound.learning import train
-from data_synth.training.ultrasound.pictures import fill_pool, read_pool
+from data_synth.training.command import (
+    add_arguments,
+    count,
+    mean_losses,
+    need_extra,
+    say_pool,
+    write,
+)
+
+try:
+    from data_synth.training.runs import TrainSettings, has_ended
+    from data_synth.training.ultrasound.learning import train
+    from data_synth.training.ultrasound.pictures import fill_pool, read_pool
+except ModuleNotFoundError as error:
+    need_extra(error)
 
 
 def main(arguments: list[str] | None = None) -> int:
