@@ -278,6 +278,31 @@ def test_a_derived_series_gives_the_slice_that_the_originals_lack_alone(tmp_path
     assert "derived images, slices that the stack has already" in line
 
 
+@pytest.mark.parametrize("away", [0.5, float(SLICES)])
+def test_slices_of_a_second_stack_between_those_of_the_first_are_told(
+    tmp_path: Path, away: float
+) -> None:
+    """As of rest and stress; a stack that goes on in another series needs no word."""
+
+    def numbered(data: FileDataset, number: int, phase: int) -> bool:
+        in_series(data, 1, "rest")
+        return True
+
+    write_dicom(tmp_path, numbered)
+    for k, (number, phase) in enumerate(ALL_FRAMES):
+        data = in_series(dicom_frame(number, phase), 5, "stress")
+        place_mm = ORIGIN_MM + (number + away) * STEP_MM * NORMAL
+        data.ImagePositionPatient = place_mm.tolist()
+        data.save_as(tmp_path / f"0{k:03d}_other.dcm")
+    stack = read_dicom_cine(tmp_path)
+    assert stack.cine.intensity.shape[1] == 2 * SLICES
+    told = [one for one in stack.remarks if "such as rest and stress" in one]
+    assert len(told) == (away < 1)
+    for one in told:
+        assert 'series 1 "rest"' in one
+        assert 'series 5 "stress"' in one
+
+
 def beats_on(data: FileDataset, later_ms: float) -> None:
     data.TriggerTime = float(data.TriggerTime) + later_ms
 

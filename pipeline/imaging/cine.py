@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from pipeline.imaging.frames import (
     MIN_SLICES,
     Frame,
     by_slice,
+    is_stack,
+    slice_positions,
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.phases import common_phases
@@ -136,6 +138,7 @@ def stack_frames(
     doubts = (
         *_doubts_of_place(chosen),
         *_doubts_of_rate(chosen),
+        *_doubts_of_series(chosen),
         *stacks_beside(frames, chosen, where),
     )
     patient = next((frame.patient for frame in chosen if frame.patient), "")
@@ -177,6 +180,22 @@ def _doubts_of_rate(frames: Sequence[Frame]) -> tuple[str, ...]:
         f"the images' RR interval is {own_ms:.0f} ms, but by their HeartRate {other_ms:.0f} ms; "
         "the first is taken: if it is not the length of a beat, give cine.rr_ms in study.yaml",
     )
+
+
+def _doubts_of_series(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """A sentence where slices of one stack lie between those of another, as of rest and stress."""
+    series: dict[str, list[Frame]] = {}
+    for frame in frames:
+        series.setdefault(frame.series_uid, []).append(frame)
+    stacks = [(one, slice_positions(one)) for one in series.values() if is_stack(one)]
+    for (one, its_mm), (other, others_mm) in combinations(stacks, 2):
+        if max(its_mm[0], others_mm[0]) < min(its_mm[-1], others_mm[-1]):
+            return (
+                f"slices of {other[0].series} lie between those of {one[0].series}, and each is a "
+                "cine stack by itself: if they show two states of the heart, such as rest and "
+                "stress, name one's number in cine.leave_out_series in study.yaml",
+            )
+    return ()
 
 
 def _require_timing(frames: Sequence[Frame]) -> None:
