@@ -36,6 +36,7 @@ from pydicom.dataset import FileDataset
 from pydicom.uid import (
     BasicTextSRStorage,
     MRImageStorage,
+    MultiFrameGrayscaleWordSecondaryCaptureImageStorage,
     SecondaryCaptureImageStorage,
 )
 
@@ -255,6 +256,16 @@ def test_pictures_whose_place_was_emptied_are_left_out(
     (line,) = stack.left_out
     assert "1 object" in line
     assert "without a place in space" in line
+
+
+def test_converted_images_that_tell_their_planes_are_the_stack(tmp_path: Path) -> None:
+    data = enhanced_object(ALL_FRAMES)
+    data.SOPClassUID = data.file_meta.MediaStorageSOPClassUID = (
+        MultiFrameGrayscaleWordSecondaryCaptureImageStorage
+    )
+    data.Modality = "OT"
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))
 
 
 def test_derived_images_alone_are_a_stack(tmp_path: Path) -> None:

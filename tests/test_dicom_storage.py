@@ -167,6 +167,21 @@ def test_values_beyond_the_bits_that_the_header_tells_are_refused(
             read_dicom_cine(tmp_path)
 
 
+def test_padding_and_bytes_behind_the_image_may_have_any_bits(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        stored = pixel_value(phase, number)
+        stored[0, 0] = 0x8000
+        data.BitsStored, data.HighBit = 12, 11
+        data.PixelPaddingValue = 0x8000
+        data.PixelData = stored.tobytes() + b"\xff\xff"
+        return True
+
+    write_dicom(tmp_path, change)
+    with pytest.warns(UserWarning, match="excess padding"):
+        found = read_dicom_cine(tmp_path).cine.intensity[2, 1]
+    assert found[0, 0] <= found[0, 1] == pixel_value(2, 1)[0, 1]
+
+
 def test_overlays_in_the_upper_bits_are_no_values(tmp_path: Path) -> None:
     def change(data: FileDataset, number: int, phase: int) -> bool:
         stored = pixel_value(phase, number)

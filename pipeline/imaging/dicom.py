@@ -210,13 +210,21 @@ def _other_object(dataset: Any) -> str | None:
     # Programs that make files anonymous may leave the attribute, and empty it.
     placed = bool(dataset.get("ImagePositionPatient"))
     placed = placed and (magnetic or bool(dataset.get("PixelSpacing")))
-    placed = placed or (magnetic and "PerFrameFunctionalGroupsSequence" in dataset)
+    placed = placed or (
+        "PerFrameFunctionalGroupsSequence" in dataset and (magnetic or _tells_planes(dataset))
+    )
     together = int(dataset.get("NumberOfFrames", 1) or 1)
     if together > 1 and "PerFrameFunctionalGroupsSequence" not in dataset:
         placed = False
     # An original MR image without a place may be one of the cine's, spoilt by an export.
     doubtful = sop_class in MR_CLASSES and _kind(dataset, pydicom.Dataset()) != DERIVED
     return None if placed or doubtful else f"{name}, without a place in space"
+
+
+def _tells_planes(dataset: Any) -> bool:
+    """Whether the functional groups of an object with many frames hold places of its planes."""
+    groups = ("PerFrameFunctionalGroupsSequence", "SharedFunctionalGroupsSequence")
+    return any("PlanePositionSequence" in item for name in groups for item in dataset.get(name, []))
 
 
 def _read_frames(dataset: Any, path: Path, rr_ms: float | None) -> list[Frame]:

@@ -31,11 +31,11 @@ def stored_pixels(dataset: Any, path: Path) -> Any:
             ) from error
     if stored.size != frames * dataset.Rows * dataset.Columns:
         raise InputError(f"{path}: is in colour; the cine needs grey images")
-    _require_bits_as_told(dataset, path)
+    _require_bits_as_told(dataset, path, stored.size)
     return stored.reshape(-1, int(dataset.Rows), int(dataset.Columns))
 
 
-def _require_bits_as_told(dataset: Any, path: Path) -> None:
+def _require_bits_as_told(dataset: Any, path: Path, count: int) -> None:
     """Refuse values larger than the header says, whose uppermost bits readers cut off.
 
     What was very bright would be dark. Before overlays had an attribute of their own they were kept
@@ -49,8 +49,12 @@ def _require_bits_as_told(dataset: Any, path: Path) -> None:
     if int(dataset.BitsAllocated) != 16 or bits >= 16 or overlays or _syntax(dataset).is_compressed:
         return
     order = ">" if _syntax(dataset) == pydicom.uid.ExplicitVRBigEndian else "<"
-    words = np.frombuffer(dataset.PixelData, f"{order}u2")
+    words = np.frombuffer(dataset.PixelData, f"{order}u2")[:count]
     beyond = words >> bits
+    padding = whole_number(dataset.get("PixelPaddingValue"))
+    if padding is not None:
+        # It need not fit: no value is measured there.
+        beyond = np.where(words == padding % 2**16, 0, beyond)
     if int(dataset.get("PixelRepresentation", 0)):
         negative = (words >> (bits - 1)) & 1
         beyond = np.where(negative & (beyond == (1 << (16 - bits)) - 1), 0, beyond)
