@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 # Okabe and Ito's colours, told apart by colour-blind readers: jfly.uni-koeln.de/color. Line styles
-# serve greyscale.
+# serve greyscale, and green and pink, which some take for grey.
 STYLES: dict[str, tuple[str, Any]] = {
     "lv_cavity": ("#D55E00", "-"),
     "lv_myocardium": ("#56B4E9", "--"),
     "rv_cavity": ("#009E73", "-."),
     "left_atrium": ("#F0E442", ":"),
-    "right_atrium": ("#CC79A7", "-"),
-    "aorta": ("#0072B2", "--"),
+    "right_atrium": ("#CC79A7", (0, (7, 1.5))),
+    "aorta": ("#0072B2", (0, (3, 1, 1, 1, 1, 1))),
 }
 """Of labels: colour and line."""
 SURFACE_STYLES = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -70,7 +71,7 @@ def thickness_map(phases: Float, segments_mm: Mapping[str, Curve]) -> Figure:
 
 
 def _cyclic(
-    axis: Axes, phases: Float, curve: Curve, colour: str, style: str, label: str | None
+    axis: Axes, phases: Float, curve: Curve, colour: str, style: Any, label: str | None
 ) -> None:
     """A curve that comes back to its start one beat later; few phases show where they are."""
     values = np.array(list(curve), float)

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patheffects import Normal, Stroke
 
 from pipeline.field.fixture import Fixture
 from pipeline.field.potential import potential
@@ -27,7 +26,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
 from pipeline.report.slices import mark_scale, mark_sides
-from pipeline.report.style import handle, show_grey, words
+from pipeline.report.style import edged, handle, show_grey, words
 
 
 class BloodFound(NamedTuple):
@@ -229,8 +228,11 @@ def _draw_field(
     alpha = 0.15 + 0.45 * 4 * value * (1 - value)
     image = axis.imshow(value, cmap="plasma", alpha=alpha, vmin=0, vmax=1, aspect=aspect)
     lines = axis.contour(distance_mm, levels=np.arange(-20, 21, 5), colors="w", linewidths=0.7)
-    axis.clabel(lines, fmt="%d mm", fontsize=9)
-    axis.contour(distance_mm, levels=[0], colors="w", linewidths=2)
+    lines.set_path_effects(edged(0.7, "black"))
+    for text in axis.clabel(lines, fmt="%d mm", fontsize=9):
+        text.set_path_effects(edged(1.5, "black"))
+    zero = axis.contour(distance_mm, levels=[0], colors="w", linewidths=2)
+    zero.set_path_effects(edged(2, "black"))
     step = 7
     force_n = field.force_n(flat, phase, fixture=fixture).reshape(*shape, 3)[::step, ::step]
     in_plane = np.stack(
@@ -241,11 +243,13 @@ def _draw_field(
         ]
     )
     rows, columns = np.mgrid[0 : shape[0] : step, 0 : shape[1] : step]
-    arrows = axis.quiver(columns, rows, *in_plane, color="#56B4E9", width=0.004)
+    arrows = axis.quiver(
+        columns, rows, *in_plane, color="#56B4E9", width=0.004, edgecolor="black", linewidth=0.4
+    )
     most_n = field.fixtures[fixture].f_max_n
     key = axis.quiverkey(arrows, 0.82, 0.04, most_n, f"{most_n:g} N", labelpos="E", color="w")
     # Its label lies over arrows.
-    key.text.set(color="w", path_effects=[Stroke(linewidth=5, foreground="black"), Normal()])
+    key.text.set(color="w", path_effects=edged(4, "black"))
     return image
 
 

@@ -173,7 +173,9 @@ def _outline(axis: Axes, labels: Label) -> None:
     for name in sorted(LABELS, key=lambda name: name != "lv_myocardium"):
         mask = labels == LABELS[name]
         if mask.any():
-            axis.contour(mask, levels=[0.5], colors=STYLES[name][0], linewidths=1.3)
+            colour, style = STYLES[name]
+            axis.contour(mask, levels=[0.5], colors="black", linewidths=2.2)
+            axis.contour(mask, levels=[0.5], colors=colour, linewidths=1.3, linestyles=[style])
 
 
 def _title(axis: Axes, name: str, confidence: float | None, low: float) -> None:
@@ -188,7 +190,7 @@ def _title(axis: Axes, name: str, confidence: float | None, low: float) -> None:
 
 def _legend(figure: Figure) -> None:
     figure.legend(
-        handles=[handle(name, STYLES[name][0], "-") for name in LABELS],
+        handles=[handle(name, *STYLES[name]) for name in LABELS],
         loc="outside lower center",
         ncols=len(LABELS),
         fontsize=8,

@@ -42,9 +42,9 @@ def show_grey(axis: Axes, image: Any, aspect: float = 1.0) -> None:
     axis.set_axis_off()
 
 
-def edged(width: float) -> list[AbstractPathEffect]:
-    """A thin grey edge on both sides of a line: without it yellow is lost on white."""
-    return [Stroke(linewidth=width + 1, foreground="#555555"), Normal()]
+def edged(width: float, colour: str = "#555555") -> list[AbstractPathEffect]:
+    """A thin edge on both sides of a line: without, yellow is lost on white, white on blood."""
+    return [Stroke(linewidth=width + 1, foreground=colour), Normal()]
 
 
 def handle(name: str, colour: str, style: Any) -> Line2D:
