@@ -268,3 +268,21 @@ def test_names_that_are_no_text_are_refused_before_a_library_ends_the_program(tm
 def locked_once(folder):
     with locked(folder):
         pass
+
+
+@pytest.mark.parametrize("module", ["data_synth.training", "data_synth.training.ultrasound"])
+def test_training_without_what_it_needs_says_how_to_install_it(tmp_path, module):
+    missing = "raise ModuleNotFoundError('No module named torch', name='torch')\n"
+    (tmp_path / "torch.py").write_text(missing)
+    paths = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--help"],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: training needs torch")
+    assert "beatfield[train]" in done.stderr
+    assert "Traceback" not in done.stderr
