@@ -160,6 +160,23 @@ def test_the_confidence_map_marks_exactly_the_low_cells(phases: int, count: int)
         assert sorted(map(tuple, marks)) == [(0, 0), (1, 2)]
 
 
+def test_numbers_of_the_confidence_map_read_on_their_colours() -> None:
+    """By the contrast of the Web Content Accessibility Guidelines (2.2, 1.4.3): 4.5 at least."""
+
+    def luminance(colour: Any) -> float:
+        share = np.array(to_rgb(colour))
+        linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    axis = slices.confidence_map(np.linspace(0.5, 1, 60).reshape(6, 10), 0.8).axes[0]
+    image = axis.images[0]
+    for text in axis.texts:
+        phase, number = map(int, text.get_position())
+        behind = image.to_rgba(np.asarray(image.get_array())[number, phase])[:3]
+        dark, light = sorted([luminance(behind), luminance(text.get_color())])
+        assert (light + 0.05) / (dark + 0.05) >= 4.5, text.get_text()
+
+
 def test_a_slice_that_was_not_judged_is_no_doubt() -> None:
     confidence = np.array([[0.9, np.nan], [0.7, np.nan]])
     assert [one.slice for one in slices.doubts(confidence, 0.8)] == [0]

@@ -8,14 +8,14 @@ from typing import Any
 from pipeline.report.page import Table, figure_row, flat_table
 
 COLUMNS = {
-    "stiffness_n_per_m": ("by its law N/m", "{:.0f}"),
-    "stiffness_measured_n_per_m": ("measured N/m", "{:.0f}"),
-    "stiffness_any_direction_p99_n_per_m": ("in any direction, p99 N/m", "{:.0f}"),
-    "stiffness_any_direction_max_n_per_m": ("the most N/m", "{:.0f}"),
-    "stiffness_limit_n_per_m": ("device renders N/m", "{:.0f}"),
+    "stiffness_n_per_m": ("by its law, N/m", "{:.0f}"),
+    "stiffness_measured_n_per_m": ("measured, N/m", "{:.0f}"),
+    "stiffness_any_direction_p99_n_per_m": ("in any direction, p99, N/m", "{:.0f}"),
+    "stiffness_any_direction_max_n_per_m": ("the most, N/m", "{:.0f}"),
+    "stiffness_limit_n_per_m": ("device renders, N/m", "{:.0f}"),
     "beyond_limit_share": ("places beyond that", "{:.1%}"),
-    "force_step_max_n_per_0_1_mm": ("most over 0.1 mm N", "{:.2f}"),
-    "force_change_max_n_per_ms": ("most over 1 ms N", "{:.3f}"),
+    "force_step_max_n_per_0_1_mm": ("most over 0.1 mm, N", "{:.2f}"),
+    "force_change_max_n_per_ms": ("most over 1 ms, N", "{:.3f}"),
 }
 """What is told of each fixture, in this order: a head, and how the figure is written."""
 

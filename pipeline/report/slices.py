@@ -28,6 +28,10 @@ MOST_WORST = 4
 MOST_NUMBERS = 60
 """A confidence map of no more cells has its numbers written in."""
 
+BLACK_READS_ABOVE = 0.72
+"""On the map's colours of higher confidence black stands out more than white does: by WCAG's
+contrast, which is at least 4.5 so."""
+
 SCALE_MM = 20.0
 
 ALARM = "#C00000"

@@ -37,13 +37,14 @@ FIELD_TOLD = (
     "The epicardium is the outside of the left ventricle's muscle: its free wall, the right side "
     "of the septum, and a lid at the valves. The potential over an MR slice, lines of equal "
     "distance every 5 mm (the surface is bold) and arrows of force. Of the certificate: p99 is "
-    "what 99 places in 100 keep under; sign errors are places taken for the wrong side; drift is "
-    "how far the surface lies off halfway between two phases (unknown where there are two phases "
-    "only: how it goes from one to the other is then a guess); the band is what lies within it of "
-    "the surface. A device has to render the fixture's stiffness, which is below its limit; what "
-    "is measured exceeds it at the share of places that is told: beside a medial axis, where two "
-    "parts of the surface are equally near and the force changes with place as fast as the grid's "
-    "spacing allows."
+    "what 99 places in 100 keep under; sign errors are places taken for the wrong side; the "
+    "gradient error is the length by which the gradient differs from the true one, which is 1 "
+    "long; drift is how far the surface lies off halfway between two phases (unknown where there "
+    "are two phases only: how it goes from one to the other is then a guess); the band is what "
+    "lies within it of the surface. A device has to render the fixture's stiffness, which is "
+    "below its limit; what is measured exceeds it at the share of places that is told: beside a "
+    "medial axis, where two parts of the surface are equally near and the force changes with "
+    "place as fast as the grid's spacing allows."
 )
 
 
@@ -261,8 +262,8 @@ def _field(job: Job, shown: Moments) -> Section:
         )
         for fixture_name, fixture in field.fixtures.items()
     ]
-    head = ["fixture", "surface", "kind", "a tool", "gamma mm", "delta mm", "m"]
-    head += ["most force N", "stiffness N/m", "device"]
+    head = ["fixture", "surface", "kind", "a tool", "gamma, mm", "delta, mm", "m"]
+    head += ["most force, N", "stiffness, N/m", "device"]
     return Section(
         "Force field",
         FIELD_TOLD,
@@ -293,8 +294,8 @@ def _evaluation(job: Job) -> list[Section]:
         return []
     metrics = read_table(folder / "metrics.json")
     rows = [_against_truth(name, one) for name, one in metrics["structures"].items()]
-    head = ["surface", "mean distance mm", "worst phase mm", "95 % Hausdorff, worst phase mm"]
-    head += ["mean Dice", "worst Dice", "motion, normal mm", "tangential mm"]
+    head = ["surface", "mean distance, mm", "worst phase, mm", "95 % Hausdorff, worst phase, mm"]
+    head += ["mean Dice", "worst Dice", "motion, normal, mm", "tangential, mm"]
     others = {key: value for key, value in metrics.items() if key != "structures"}
     return [
         Section(
