@@ -230,7 +230,7 @@ def _write_numbers(axis: Axes, confidence: Float, low: float) -> None:
     for (phase, number), value in np.ndenumerate(confidence):
         text = f"{value:.2f}" if np.isfinite(value) else "-"
         text += " (low)" if value < low else ""
-        colour = "white" if value < 0.8 else "black"
+        colour = "white" if value < BLACK_READS_ABOVE else "black"
         axis.text(phase, number, text, ha="center", va="center", fontsize=8, color=colour)
 
 
