@@ -13,10 +13,11 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, Token
 
 from pipeline import __version__
 from pipeline.caches import provide_place
@@ -41,6 +42,14 @@ app = App(
 STUDY = "folder of the study: cine/, and where there are any ecg/, us/, study.yaml"
 Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]
 Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults without it")]
+
+
+def _whole(_type: type[int], tokens: Sequence[Token]) -> int:
+    """The parser's own way rounds 1.5 to 2."""
+    return int(tokens[0].value)
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def _run(
@@ -164,7 +173,7 @@ def batch(
     /,
     *,
     out: Out,
-    workers: int = 1,
+    workers: Whole = 1,
     config: Config = None,
     until: str | None = None,
 ) -> int:
@@ -376,6 +385,18 @@ def paper(out: Path, /, options: Annotated[PaperOptions, Parameter(name="*")] = 
     return 0
 
 
+def _require_no_empty(arguments: Sequence[str]) -> None:
+    """An empty path would be the folder in which the user happens to be."""
+    for before, one in pairwise(("", *arguments)):
+        name, equals, value = one.partition("=")
+        if not one or (name.startswith("--") and equals and not value):
+            option = name or (before if before.startswith("--") else "")
+            where = option or (f"what follows {before}" if before else "the first argument")
+            raise InputError(
+                f"{where}: is empty, as where a variable of the shell has no value; give it a value"
+            )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     # What is half-done is cleared away, as when a person interrupts.
@@ -386,7 +407,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     warnings.formatwarning = warning_line
 
+    given = sys.argv[1:] if arguments is None else arguments
+
     def command() -> Any:
+        _require_no_empty(given)
         provide_place()
         return app(arguments, exit_on_error=False, print_error=True)
 

@@ -27,6 +27,10 @@ from pipeline.summary import summary
         (["batch", "none", "--out", "o"], "none: no such folder"),
         (["batch", ".", "--out", "o", "--workers", "0"], "at least 1 is needed"),
         (["batch", ".", "--out", "o"], "holds no study"),
+        (["run", "", "--out", "o"], "what follows run: is empty"),
+        (["run", "p", "--out", ""], "--out: is empty, as where a variable"),
+        (["run", "p", "--out=", "--until", "bake"], "--out: is empty"),
+        ([""], "the first argument: is empty"),
         (["batch", ".", "--out", "o", "--config", "none.yaml"], "none.yaml: no such file"),
         (
             ["run", "p", "--out", "o", "--from", "bake", "--until", "surface"],
@@ -50,7 +54,13 @@ def test_wrong_input_ends_with_exit_code_2_and_says_what_is_wrong(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["rnu", "p"], ["run", "p"], ["run", "p", "--out", "o", "--untill", "bake"]]
+    "arguments",
+    [
+        ["rnu", "p"],
+        ["run", "p"],
+        ["run", "p", "--out", "o", "--untill", "bake"],
+        ["batch", "p", "--out", "o", "--workers", "1.5"],
+    ],
 )
 def test_a_wrong_command_ends_with_exit_code_2(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
