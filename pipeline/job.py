@@ -35,6 +35,9 @@ class Job:
     progress: Progress
     """Told how much is done, of how much."""
 
+    inputs: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """SHA-256 of the study's files that the stage depends on, by kind and path."""
+
     skipped: Mapping[str, str] = field(default_factory=dict)
     """Why a stage before this one made nothing, for a stage that repeats such reasons."""
 

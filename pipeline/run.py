@@ -67,7 +67,8 @@ STAGES = (
     Stage(
         "report",
         after=("ingest", "segment", "surface", "register", "bake", "evaluate"),
-        inputs=("us",),
+        inputs=("cine", "mr_ecg", "us"),
+        settings=("segment", "surface", "register", "bake", "fixtures"),
         repeats_reasons=True,
     ),
 )
@@ -283,7 +284,8 @@ def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
     for name in stage.after:
         require_unaltered(run.products / name)
     with publishing(target) as folder:
-        told = run.watcher.progress, _reasons(run, stage)
+        inputs = {kind: run.inputs[kind] for kind in stage.inputs}
+        told = run.watcher.progress, inputs, _reasons(run, stage)
         job = Job(run.study, run.settings, run.products, folder, *told)
         figures: dict[str, Any] = module.run(job)
         _require_inputs_of_the_start(run, stage)

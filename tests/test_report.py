@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from PIL import Image
 
+from pipeline.config import Settings
 from pipeline.errors import StageError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.labels import LABELS
@@ -27,6 +28,7 @@ from pipeline.report.animation import HEAD, ROOM, TOWARDS_VIEWER, _webp, even_in
 from pipeline.report.colours import STYLES
 from pipeline.report.moments import MARGIN_PIXELS, Moments
 from pipeline.report.page import Opening, figure_row, render
+from pipeline.report.provenance import provenance
 from pipeline.report.style import as_png, as_svg, as_webp
 
 PAGE_LIMIT_BYTES = 6_000_000
@@ -450,3 +452,29 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
     ]
     assert len(kept.head) == len(kept.rows[0])
     assert others.rows == [("band", "15 mm")]
+
+
+def test_the_page_tells_what_it_was_made_of_as_sha256sum_does(tmp_path: Path) -> None:
+    for name, text in {"cine/b.dcm": "one", "cine/A.dcm": "two", "manifest.json": "{}"}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    def printed(command: str) -> str:
+        shell = ["bash", "-c", command]
+        return subprocess.run(
+            shell, cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout
+
+    digests = dict(line.split("  ")[::-1] for line in printed("sha256sum cine/*").splitlines())
+    settings = Settings.model_validate({"bake": {"spacing_mm": 2.5}, "register": {"min_frames": 7}})
+    section = provenance({"cine": digests, "us": {}}, settings, tmp_path / "manifest.json")
+    files, changed, software = section.tables
+    of_cine = printed("sha256sum cine/* | LC_ALL=C sort -k 2 | sha256sum").split()[0]
+    assert files.rows == [
+        ("cine", "2 files", of_cine),
+        ("bake/field.zarr/manifest.json", "1 file", printed("sha256sum manifest.json").split()[0]),
+    ]
+    assert changed.rows == [("register.min_frames", "7", "10"), ("bake.spacing_mm", "2.5", "1.5")]
+    assert ("numpy", np.__version__) in software.rows
+    (said,) = provenance({}, Settings(), tmp_path / "manifest.json").tables[1].rows
+    assert said == ("all", "default", "")

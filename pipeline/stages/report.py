@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.field.fixture import Fixture
+from pipeline.field.manifest import MANIFEST
 from pipeline.field.reader import ForceField
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Cine
@@ -20,6 +21,7 @@ from pipeline.products import read_cine, read_frames, read_surfaces, read_table
 from pipeline.report import certificate, heart, pictures, slices
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
+from pipeline.report.provenance import provenance
 from pipeline.report.registered import registration, registration_notes
 from pipeline.report.style import as_png, as_svg
 from pipeline.summary import (
@@ -64,6 +66,7 @@ def run(job: Job) -> dict[str, Any]:
         *registration(job, surfaces),
         _field(job, shown),
         *_evaluation(job),
+        provenance(job.inputs, job.settings, job.products / "bake" / "field.zarr" / MANIFEST),
     ]
     page = render(
         job.study.patient_id,
@@ -206,7 +209,7 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
         told.append(f"{doubtful} slices are of low confidence in some phase: see Segmentation.")
     for text in cut_off_by(_cut_off(job, of_field=False), job.figures("ingest")):
         told.append(f"Cut off by the stack's end, and of no fixture: {text}.")
-    told.append(f"Made by beatfield {__version__}; products and settings are those of run.json.")
+    told.append(f"Made by beatfield {__version__}: of what, the end of the page tells.")
     unused = series_left_out(job.figures("ingest"))
     told += [f"Of the cine's folder nothing is made of {text}." for text in unused]
     return Opening(f"{where} {found}", warnings, told)
