@@ -302,9 +302,11 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
     out
         Folder to write; must not exist.
     """
-    from pipeline.field.export import export_field
+    from pipeline.field.export import export_field, lost_in
 
     show(f"exported  {export_field(field, to, out)}")
+    if lost := lost_in(field, to):
+        show(f"note      {lost}")
     return 0
 
 

@@ -117,9 +117,8 @@ def what_was_baked(field: Path) -> list[str]:
     """How exact a field is, and what its fixtures do: some may be defaults that nobody wrote."""
     baked = ForceField.open(field)
     off_mm, about_mm = (baked.accuracy[f"{name}_error_p99_mm"] for name in ("surface", "distance"))
-    count = len(baked.phases)
     return [
-        f"phases    {count}{', so nothing moves' if count == 1 else ''}",
+        f"phases    {_timing_of(baked)}",
         f"accuracy  {off_mm:.2g} mm off on the surfaces at most and {about_mm:.2g} mm within "
         f"{BAND_MM:g} mm of them, in 99 places of 100",
     ] + [
@@ -128,6 +127,21 @@ def what_was_baked(field: Path) -> list[str]:
         f"{one.resolved_gamma_mm:.1f} mm, for the {one.device.name}"
         for name, one in baked.fixtures.items()
     ]
+
+
+def _timing_of(baked: ForceField) -> str:
+    """How many phases, and what the field does not know of time and place."""
+    count = len(baked.phases)
+    if count == 1:
+        said = "1, so nothing moves"
+    elif np.allclose(baked.phases, np.arange(count) / count, atol=1e-6):
+        said = f"{count}, evenly spaced from 0"
+    else:
+        said = ", ".join(f"{phase:.3f}".rstrip("0").rstrip(".") for phase in baked.phases)
+    unknown = [] if baked.rr_s or count == 1 else ["the length of the beat (rr_s)"]
+    unknown += [] if baked.mr_from_tracker is not None else ["a tracker (mr_from_tracker)"]
+    told = f"; {' and '.join(unknown)} not known: phases.json may tell" if unknown else ""
+    return said + told
 
 
 def _cause(surfaces: Mapping[str, SurfaceSeries]) -> str:

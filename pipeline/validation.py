@@ -99,9 +99,15 @@ def describe_validation(
         elif one["type"] in ("too_short", "too_long"):
             needed = one["ctx"].get("min_length", one["ctx"].get("max_length"))
             message = f"needs {needed} entries, not {one['ctx']['actual_length']}"
-        came = "" if isinstance(one["input"], dict) else f" (got {one['input']!r})"
+        came = "" if isinstance(one["input"], dict) else f" (got {_short(one['input'])})"
         lines.append(f"{where}: {key}: {message}{came}")
     return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    """As Python writes it, its middle left out where it is long."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:100]} ... {text[-60:]}"
 
 
 def _instead(

@@ -105,6 +105,17 @@ int main(int count, char **words)
             bent.count = 1;
             printf("%.17g\n", bf_outside_share(&field, &bent, pose));
         }
+    } else if (!strcmp(command, "nowhere")) {
+        /* A line within the grid of which one number is none. */
+        double pose[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+        int n;
+        for (n = 0; n < 27; n++) {
+            double line[9] = {0, 0, 0, 0, 0, 5, 0, 0, 9};
+            bf_tool spoilt = {NULL, 3, 0, {0, 0, 0}};
+            spoilt.points_mm = line;
+            line[n % 9] = n < 9 ? NAN : n < 18 ? INFINITY : -INFINITY;
+            printf("%.17g\n", bf_outside_share(&field, &spoilt, pose));
+        }
     } else if (!strcmp(command, "often")) {
         int n;
         for (n = 0; n < 60 && status == BF_OK; n++) {

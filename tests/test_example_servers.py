@@ -211,7 +211,7 @@ int main(int count, char **words)
     bf_field field;
     bf_clock clock = bf_new_clock(0.8, 5);
     bf_tank tank = bf_full_tank(5, 20);
-    tip tool = {{0, 0, 0}, 0};
+    tip tool = {{0, 0, 0}, 2, 0};
     long turn;
     if (count < 2 || bf_open(&field, words[1]) != BF_OK) return 1;
     field.fixture[0].device_force_n = 1.2;

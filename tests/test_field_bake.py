@@ -21,7 +21,7 @@ from pipeline.field.fixture import Bounds
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface
-from pipeline.own_surfaces import bake_own_surfaces, measure_field
+from pipeline.own_surfaces import bake_own_surfaces, measure_field, what_was_baked
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
 
@@ -350,6 +350,13 @@ def test_timing_and_tracker_of_ones_own(folder, tmp_path):
     np.testing.assert_array_equal(field.phases, [0.1, 0.2, 0.6])
     assert field.rr_s == 0.9
     np.testing.assert_array_equal(field.mr_from_tracker, np.eye(4))
+    assert what_was_baked(tmp_path / "out" / "field.zarr")[0] == "phases    0.1, 0.2, 0.6"
+    (folder / "phases.json").unlink()
+    bare = bake_own_surfaces(folder, tmp_path / "bare", own_settings())
+    assert what_was_baked(bare)[0] == (
+        "phases    3, evenly spaced from 0; the length of the beat (rr_s) and a tracker "
+        "(mr_from_tracker) not known: phases.json may tell"
+    )
 
 
 def test_a_single_file_is_a_surface_at_rest(tmp_path):

@@ -168,14 +168,18 @@ def test_the_same_bytes_every_time(path, folders, form):
     shutil.rmtree(again)
 
 
-def test_without_a_heartbeat_times_are_phases(path, tmp_path):
-    field = tmp_path / "field.zarr"
-    shutil.copytree(path, field)
+def set_beat(field: Path, rr_s: float | None) -> None:
     content = json.loads((field / "zarr.json").read_text())
-    content["attributes"]["beatfield"]["rr_s"] = None
+    content["attributes"]["beatfield"]["rr_s"] = rr_s
     (field / "zarr.json").write_text(json.dumps(content))
     (field / "manifest.json").unlink()
     write_manifest(field)
+
+
+def test_without_a_heartbeat_times_are_phases(path, tmp_path):
+    field = tmp_path / "field.zarr"
+    shutil.copytree(path, field)
+    set_beat(field, None)
 
     export_field(field, "nrrd", tmp_path / "nrrd")
     export_field(field, "nifti", tmp_path / "nifti")
@@ -192,6 +196,26 @@ def test_command_writes_and_says_where(path, tmp_path, capsys):
     assert main(["export", str(path), "--to", "mhd", "--out", str(tmp_path / "out")]) == 0
     assert str(tmp_path / "out") in capsys.readouterr().out
     assert (tmp_path / "out" / "distance_ball.mhd").exists()
+
+
+@pytest.mark.parametrize(
+    ("phases", "form", "off"),
+    [
+        ((0.1, 0.15, 0.8), "nifti", "0.255 s"),
+        ((0.1, 0.15, 0.8), "mhd", "0.255 s"),
+        ((0.1, 0.15, 0.8), "nrrd", None),
+        ((0.1, 0.35, 0.6, 0.85), "nifti", None),
+        ((0.4,), "mhd", None),
+    ],
+)
+def test_times_that_a_format_cannot_say_are_told(tmp_path, capsys, phases, form, off):
+    """Of 0.9 s a beat: the second of three even phases would be at 0.39 s, and is at 0.135 s."""
+    write_random(tmp_path / "f.zarr", 7, np.array(phases))
+    set_beat(tmp_path / "f.zarr", 0.9)
+    assert main(["export", str(tmp_path / "f.zarr"), "--to", form, "--out", f"{tmp_path}/o"]) == 0
+    said = capsys.readouterr().out
+    assert ("not evenly spaced" in said) == (off is not None)
+    assert off is None or f"up to {off} off" in said
 
 
 def test_what_is_wrong_is_said_and_nothing_is_written(path, tmp_path, capsys):

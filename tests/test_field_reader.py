@@ -1,9 +1,11 @@
 """Questions to a baked field: against closed forms, plain NumPy, and difference quotients."""
 
 import json
+import pickle
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -37,6 +39,13 @@ def path(tmp_path_factory):
 @pytest.fixture(scope="module")
 def field(path):
     return ForceField.open(path)
+
+
+def test_another_process_gets_a_field_by_its_path(path, field):
+    for copy in (pickle.loads(pickle.dumps(field)), deepcopy(field)):
+        point, phase = (9.0, -4.0, 2.0), 0.3
+        assert copy.force_at(*point, phase) == field.force_at(*point, phase)
+    assert len(pickle.dumps(field)) < 1000
 
 
 def random_points(count: int, seed: int = 0) -> Float:

@@ -385,6 +385,10 @@ def test_both_languages_tell_the_same_share_outside_the_grid(path, program):
         assert run(program, path, "outside", given=given).stdout.split() == [b"1", b"1", b"1"]
 
 
+def test_a_tool_of_which_a_number_is_none_is_nowhere(path, program):
+    assert run(program, path, "nowhere").stdout.split() == [b"1"] * 27
+
+
 def test_a_tool_leaves_an_oblong_grid_where_its_axis_ends(tmp_path, program):
     """From the grid's first corner 40 mm along y, of which the grid has 8."""
     write_random(tmp_path / "f.zarr", 7, EVEN)

@@ -60,6 +60,20 @@ def export_field(path: Path, form: str, out: Path) -> Path:
     return out
 
 
+def lost_in(path: Path, form: str) -> str:
+    """What a format cannot say of a field, in words; empty where it says all."""
+    field = _Stored(path, read_metadata(path))
+    even = field.times[0] + field.beat * np.arange(len(field.times)) / len(field.times)
+    off = float(np.abs(even - field.times).max())
+    if form not in EVENLY or off < EVEN_ENOUGH * field.beat:
+        return ""
+    unit = "s" if field.about.rr_s else "of a beat"
+    return (
+        f"phases are not evenly spaced, and 4D files of {form} count them as if they were: times "
+        f"are up to {off:.3f} {unit} off; those of nrrd and vti are not"
+    )
+
+
 class _Stored:
     """The values of a store, a phase at a time."""
 
@@ -255,3 +269,9 @@ WRITERS: dict[str, Callable[[_Stored, Path], None]] = {
     "mhd": _mhd,
     "sofa": _sofa,
 }
+
+EVENLY = ("nifti", "mhd")
+"""Formats whose time axis is a first moment and a step."""
+
+EVEN_ENOUGH = 0.001
+"""Of a beat: less than times of triggers are known to."""

@@ -99,7 +99,10 @@ def as_points(points_mm: npt.ArrayLike) -> Float:
     """``(n, 3)``; raises InputError for any other shape."""
     points = as_numbers(points_mm, "points")
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points must be (n, 3) in mm, got an array of shape {points.shape}")
+        raise InputError(
+            f"points must be (n, 3) in mm, got an array of shape {points.shape}; of one point give "
+            "[[x, y, z]], or ask force_at or distance_at"
+        )
     return points
 
 

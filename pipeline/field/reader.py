@@ -6,7 +6,7 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -122,6 +122,10 @@ class ForceField:
         if require_manifest(path) != manifest:
             raise InputError(f"{path}: was replaced while it was opened; open it again")
         return field
+
+    def __reduce__(self) -> tuple[Callable[[Path], ForceField], tuple[Path]]:
+        """Another process, or a copy, opens the field anew: mapped values stay where they are."""
+        return ForceField.open, (self._path,)
 
     @property
     def phases(self) -> Float:

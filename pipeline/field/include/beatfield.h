@@ -2061,7 +2061,8 @@ double bf_outside_share(const bf_field *field, const bf_tool *tool, const double
         total += length;
         outside += leaves > enters ? length * (1 - leaves + enters) : length;
     }
-    if (tool->count > 0 && !(total > 0)) {
+    /* Not so where it is no number: then there is no telling. */
+    if (tool->count > 0 && total <= 0) {
         double point_mm[3];
         bf_transform(mr_from_tool, tool->points_mm, point_mm);
         return !bf_contains(field, point_mm);
