@@ -116,6 +116,13 @@ int main(int count, char **words)
             line[n % 9] = n < 9 ? NAN : n < 18 ? INFINITY : -INFINITY;
             printf("%.17g\n", bf_outside_share(&field, &spoilt, pose));
         }
+    } else if (!strcmp(command, "numbers")) {
+        static char text[200000];
+        bf__json j = {NULL, NULL, 0};
+        j.at = text;
+        j.end = text + fread(text, 1, sizeof text, stdin);
+        for (bf__blank(&j); !j.bad && j.at < j.end; bf__blank(&j)) printf("%.17g\n", bf__number(&j));
+        printf("%d\n", j.bad);
     } else if (!strcmp(command, "often")) {
         int n;
         for (n = 0; n < 60 && status == BF_OK; n++) {

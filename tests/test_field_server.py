@@ -385,6 +385,26 @@ def test_both_languages_tell_the_same_share_outside_the_grid(path, program):
         assert run(program, path, "outside", given=given).stdout.split() == [b"1", b"1", b"1"]
 
 
+def test_numbers_are_read_as_python_reads_them(path, program):
+    """As JSON writers write numbers of 17 digits; to the last bit where long double has 64 bits."""
+    rng = np.random.default_rng(11)
+    numbers = rng.normal(0, 100, 3000)
+    numbers[::3] *= 10.0 ** rng.integers(-200, 200, 1000)
+    texts = [repr(float(one)) for one in numbers]
+    texts += ["0", "-0.0", "1e400", "-1e400", "1e-400", "0e999", "0.0001234567890123456789012345"]
+    texts += ["123456789012345678901234567890", "1" + 40 * "0" + "e-40", "0." + 30 * "0" + "1e31"]
+    said = run(program, path, "numbers", given=" ".join(texts).encode()).stdout.split()
+    found, known = np.array(said[:-1], float), np.array(texts, float)
+    assert said[-1] == b"0"
+    whole = np.abs(known) < 1e27
+    np.testing.assert_allclose(found, known, rtol=2e-15)
+    if np.finfo(np.longdouble).nmant >= 63:
+        assert np.mean(found[whole] == known[whole]) > 0.995
+    assert str(found[len(numbers) + 1]) == "-0.0"
+    for bad in ("-", "1e", "e5", ".", "x"):
+        assert run(program, path, "numbers", given=bad.encode()).stdout.split()[-1] == b"1"
+
+
 def test_a_tool_of_which_a_number_is_none_is_nowhere(path, program):
     assert run(program, path, "nowhere").stdout.split() == [b"1"] * 27
 

@@ -293,7 +293,7 @@ typedef struct {
     int bad; /* once set, the cursor stays where it is */
 } bf__json;
 
-enum { BF__DEPTH = 64 };
+enum { BF__DEPTH = 64, BF__POWER = 1000 };
 
 static void bf__blank(bf__json *j)
 {
@@ -335,23 +335,26 @@ static void bf__string(bf__json *j, const char **start, size_t *length)
     j->at++;
 }
 
-/* A number, whatever the program's locale says of decimal points; rounded to a few 1e-16. */
+/* A number, whatever the program's locale says of decimal points. Where long double has 64 bits of mantissa, as on
+ * x86, 19 digits and powers of ten up to 27 are exact, and so are nearly all numbers of 17 digits in double; elsewhere
+ * they are rounded to a few 1e-16 of their size. */
 static double bf__number(bf__json *j)
 {
-    double value = 0, scale = 1;
-    int negative, digits = 0, exponent = 0, power = 0, down;
+    long double value = 0, scale = 1;
+    int negative, digits = 0, shift = 0, power = 0, down;
     bf__blank(j);
     if (j->bad) return 0;
     negative = j->at < j->end && *j->at == '-';
     if (negative) j->at++;
-    for (; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++)
-        value = 10 * value + (*j->at - '0');
+    for (; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits = 1) {
+        if (value < 1e18L) value = 10 * value + (*j->at - '0');
+        else if (shift < BF__POWER) shift++;
+    }
     if (j->at < j->end && *j->at == '.') {
-        for (j->at++; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++) {
-            /* Digits past the seventeenth change nothing. */
-            if (scale < 1e17) {
+        for (j->at++; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits = 1) {
+            if (value < 1e18L && shift > -BF__POWER) {
                 value = 10 * value + (*j->at - '0');
-                scale *= 10;
+                shift--;
             }
         }
     }
@@ -359,14 +362,16 @@ static double bf__number(bf__json *j)
         j->at++;
         down = j->at < j->end && *j->at == '-';
         if (j->at < j->end && (*j->at == '-' || *j->at == '+')) j->at++;
-        for (digits = 0; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits++)
-            if (power < 1000) power = 10 * power + (*j->at - '0');
-        exponent = down ? -power : power;
+        for (digits = 0; j->at < j->end && *j->at >= '0' && *j->at <= '9'; j->at++, digits = 1)
+            if (power < BF__POWER) power = 10 * power + (*j->at - '0');
+        shift += down ? -power : power;
     }
     if (!digits) j->bad = 1;
-    value /= scale;
-    if (exponent) value *= pow(10.0, exponent);
-    return negative ? -value : value;
+    if (value > 0) {
+        for (power = shift < 0 ? -shift : shift; power > 0; power--) scale *= 10;
+        value = shift < 0 ? value / scale : value * scale;
+    }
+    return (double)(negative ? -value : value);
 }
 
 static void bf__skip(bf__json *j, int depth)
