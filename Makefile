@@ -19,6 +19,7 @@ WORKERS ?= 2
 
 # Rules read them as "$$STUDY", for names may hold spaces and quotes; Make itself takes $$ for $.
 export STUDY OUT STUDIES CONFIG
+$(foreach one,STUDY OUT STUDIES CONFIG,$(if $(strip $($(one))),,$(error $(one)= is empty: give it a value)))
 # A study of one's own is there, and Make knows no names with spaces.
 DEMO_STUDY := $(if $(filter-out $(DEMO),$(STUDY)),$(READY),$(DEMO)/study.yaml)
 
@@ -43,8 +44,8 @@ $(READY): requirements.lock pyproject.toml
 
 demo: $(DEMO_STUDY) ## a synthetic patient becomes a force field, with a report at the end (SEED=1)
 	mkdir -p "$$OUT"
-	$(BIN)/beatfield run "$$STUDY" --out "$$OUT" --config "$$CONFIG" | tee "$$OUT.txt"
-	@sed -n 's/^query  *beatfield //p' "$$OUT.txt" | xargs $(BIN)/beatfield
+	$(BIN)/beatfield run "$$STUDY" --out "$$OUT" --config "$$CONFIG" | tee "$${OUT%/}.txt"
+	@sed -n 's/^query  *beatfield //p' "$${OUT%/}.txt" | xargs $(BIN)/beatfield
 
 $(DEMO)/study.yaml: $(READY)
 	$(BIN)/beatfield synth demo/studies-$(SEED) --seed $(SEED) --overwrite

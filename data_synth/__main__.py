@@ -94,6 +94,16 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
+class _Once(argparse.Action):
+    """Refuses what is given twice, of which else the last would count."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: Any = None) -> None:
+        """Keep the value."""
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f"argument {option}: given a second time; keep one of them")
+        setattr(namespace, self.dest, values)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m data_synth", description="Make synthetic patient studies with known truth."
@@ -103,7 +113,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, help="patient number k has SEED + k - 1 (default 1)")
     parser.add_argument("--patients", type=int, default=1, metavar="N", help="how many (default 1)")
-    parser.add_argument("--config", type=Path, metavar="YAML", help="settings of the phantom")
+    parser.add_argument(
+        "--config", type=Path, action=_Once, metavar="YAML", help="settings of the phantom"
+    )
     parser.add_argument(
         "--pathology",
         metavar="NAME",

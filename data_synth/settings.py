@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
@@ -114,7 +115,9 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     content = {} if content is None else content
     if not isinstance(content, dict):
         raise SynthError(f"{where}: needs keys and values, such as `spread: 1.0`")
-    return check_settings({**content, **(changes or {})}, where)
+    # Nor does a section of which all keys are commented out.
+    sections = {name: {} if value is None else value for name, value in content.items()}
+    return check_settings({**sections, **(changes or {})}, where)
 
 
 def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:
@@ -125,10 +128,25 @@ def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:
     SynthError
         When a key or a value is wrong; all faults are listed.
     """
+    if truths := list(_truths(content, PhantomSettings)):
+        raise SynthError(
+            "\n".join(f"{where}: {key}: true and false are no numbers" for key in truths)
+        )
     try:
         return PhantomSettings.model_validate(content)
     except ValidationError as error:
         raise SynthError(describe(error, where)) from error
+
+
+def _truths(content: dict[str, Any], model: type[BaseModel], head: str = "") -> Iterator[str]:
+    """Keys of numbers that were given true or false, which the library takes for 1 and 0."""
+    for name, field in model.model_fields.items():
+        value, kinds = content.get(name), {field.annotation, *get_args(field.annotation)}
+        below = [one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)]
+        if below and isinstance(value, dict):
+            yield from _truths(value, below[0], f"{head}{name}.")
+        elif isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
+            yield f"{head}{name}"
 
 
 def _instead(place: tuple[int | str, ...]) -> str:

@@ -213,6 +213,13 @@ def batch(
     return 0 if all(one.status in ("done", NO_STUDY) for one in ended.outcomes) else 1
 
 
+def _tell_if_stale(field: Path) -> None:
+    from pipeline.publish import stale_words
+
+    if words := stale_words(field):
+        say(f"note: {words}")
+
+
 @app.command
 def query(
     field: Path,
@@ -241,6 +248,7 @@ def query(
     from pipeline.field.query import limits_words, query_inside
 
     answers = query_inside(field, point, phase, fixture)
+    _tell_if_stale(field)
     if as_json:
         show(json.dumps(answers))
         return 0
@@ -280,6 +288,7 @@ def _verify(field: Path, surfaces: Path | None) -> None:
     from pipeline.field.verify import certificate_rows, verify_field
 
     show(f"{field}: {verify_field(field)}")
+    _tell_if_stale(field)
     if surfaces is not None:
         from pipeline.own_surfaces import measure_field
 
@@ -305,6 +314,7 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
     from pipeline.field.export import export_field, lost_in
 
     show(f"exported  {export_field(field, to, out)}")
+    _tell_if_stale(field)
     if lost := lost_in(field, to):
         show(f"note      {lost}")
     return 0

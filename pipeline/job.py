@@ -38,6 +38,9 @@ class Job:
     inputs: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     """SHA-256 of the study's files that the stage depends on, by kind and path."""
 
+    fingerprint: str = ""
+    """Of all that the stage's product is made of, as ``stage.json`` and ``run.json`` have it."""
+
     skipped: Mapping[str, str] = field(default_factory=dict)
     """Why a stage before this one made nothing, for a stage that repeats such reasons."""
 

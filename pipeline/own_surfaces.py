@@ -14,14 +14,14 @@ import numpy as np
 from pydantic import Field, ValidationError
 from scipy.sparse.csgraph import connected_components
 
-from pipeline import __version__
+from pipeline import INTENDED_USE, __version__
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM, certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.files import read_metadata
-from pipeline.field.fixture import BakeSettings, Bounds, Fixture
+from pipeline.field.fixture import BakeSettings, Fixture
 from pipeline.field.metadata import Transform, require_name, require_phases
 from pipeline.field.reader import ForceField
 from pipeline.field.winding import winding_number
@@ -102,7 +102,12 @@ def bake_own_surfaces(
                 settings.bake,
                 mr_from_tracker=None if transform is None else np.array(transform),
                 rr_s=own.timing.rr_s,
-                source={"surfaces": own.digests, "beatfield": __version__},
+                source={
+                    "use": INTENDED_USE,
+                    "surfaces": own.digests,
+                    "beatfield": __version__,
+                    "bake": settings.bake.model_dump(mode="json"),
+                },
                 progress=progress,
             )
         except StageError as error:
@@ -207,9 +212,10 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
     InputError
         When the field cannot be opened, or a surface is missing or none of those it was baked from.
     StageError
-        When the field is out of the default bounds.
+        When the field is out of the bounds that it was baked to, or else the default ones.
     """
     field = ForceField.open(path)
+    settings = BakeSettings.model_validate(field.source.get("bake", {}))
     count = len(field.phases)
     own = read_own_surfaces(folder, field.structures, count)
     _require_same_surfaces(folder, own, path, field)
@@ -220,7 +226,7 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
     accuracy = certify(
         field,
         surfaces,
-        BakeSettings().samples,
+        settings.samples,
         lambda: progress(next(done), count) if progress else None,
     )
     said, found = (
@@ -232,7 +238,7 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
             f"{folder}: the surfaces lie up to {found:.2f} mm beside what {path} holds, {said:.1g} "
             "mm when it was baked; verify needs the very ones that it was baked from"
         )
-    require_bounds(accuracy, Bounds(), min(field.grid.spacing_mm))
+    require_bounds(accuracy, settings.bounds, min(field.grid.spacing_mm))
     return accuracy
 
 

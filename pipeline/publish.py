@@ -17,7 +17,7 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import InputError
+from pipeline.errors import NOT_TO_BE_USED, InputError
 from pipeline.regular_files import require_text_name
 
 PARTIAL = ".partial-"
@@ -240,6 +240,20 @@ def read_record(products: Path | None) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def stale_words(field: Path) -> str:
+    """That a field is not what the last run over its study was to make; empty where it is, or
+    where nothing is said of it."""
+    stages = read_record(field.resolve().parents[1]).get("stages")
+    entry = stages.get("bake") if isinstance(stages, dict) else None
+    status = entry.get("status") if isinstance(entry, dict) else None
+    if field.resolve().parent.name != "bake" or status in (None, "done"):
+        return ""
+    return (
+        f"{field}: came of an earlier run than the last, which had other input or settings and did "
+        f"not come to it (run.json: {status}); {NOT_TO_BE_USED}"
+    )
 
 
 def record_stamp(products: Path | None) -> tuple[int, int]:

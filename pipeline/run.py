@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,6 +25,7 @@ from pipeline.sealing import (
     code_digest,
     fingerprint,
     library_versions,
+    network_digests,
     require_same_study,
     require_unaltered,
     seal,
@@ -58,7 +60,13 @@ STAGES = (
     Stage(
         "register", after=("ingest", "segment", "surface"), inputs=("us",), settings=("register",)
     ),
-    Stage("bake", after=("ingest", "surface", "register"), settings=("bake", "fixtures")),
+    Stage(
+        "bake",
+        after=("ingest", "surface", "register"),
+        # Their digests stand in the field.
+        inputs=("cine", "mr_ecg", "us"),
+        settings=("bake", "fixtures"),
+    ),
     Stage(
         "evaluate",
         after=("ingest", "segment", "surface", "register", "bake"),
@@ -74,6 +82,9 @@ STAGES = (
 )
 
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+MEASURED = ("seconds", "peak_memory_mb", "finished")
+"""What is told of a stage's run and does not decide its product."""
 
 
 class Watcher(Protocol):
@@ -185,7 +196,9 @@ def _bring_up_to_date(run: _Run, stage: Stage, force: bool) -> None:
             error.add_note(f"{word}: {text}")
         raise
     seconds = time.perf_counter() - clock
-    measured = {"seconds": round(seconds, 3), "peak_memory_mb": round(memory.megabytes())}
+    ended = datetime.now(UTC).isoformat(timespec="seconds")
+    figures_of_run = (round(seconds, 3), round(memory.megabytes()), ended)
+    measured = dict(zip(MEASURED, figures_of_run, strict=True))
     run.stages[stage.name] = _entry(run, stage.name, "done", figures, key, measured)
     _record(run, "running")
     run.watcher.ended(stage.name, "done", seconds)
@@ -285,11 +298,12 @@ def _execute(run: _Run, stage: Stage, target: Path, key: str) -> dict[str, Any]:
         require_unaltered(run.products / name)
     with publishing(target) as folder:
         inputs = {kind: run.inputs[kind] for kind in stage.inputs}
-        told = run.watcher.progress, inputs, _reasons(run, stage)
-        job = Job(run.study, run.settings, run.products, folder, *told)
+        reasons, settings = _reasons(run, stage), _settings_of(run, stage)
+        about = run.watcher.progress, inputs, key, reasons
+        job = Job(run.study, run.settings, run.products, folder, *about)
         figures: dict[str, Any] = module.run(job)
         _require_inputs_of_the_start(run, stage)
-        seal(folder, key, figures)
+        seal(folder, key, figures, settings)
     return figures
 
 
@@ -316,7 +330,6 @@ def _reasons(run: _Run, stage: Stage) -> dict[str, str]:
 
 
 def _fingerprint(run: _Run, stage: Stage) -> str:
-    settings = run.settings.model_dump(mode="json", by_alias=True)
     before = {name: sealed(run.products / name) for name in stage.after}
     return fingerprint(
         {
@@ -324,7 +337,7 @@ def _fingerprint(run: _Run, stage: Stage) -> str:
             "patient_id": run.study.patient_id,
             "inputs": {kind: run.inputs[kind] for kind in stage.inputs},
             "study": _described(run.study, stage),
-            "settings": {name: settings[name] for name in stage.settings},
+            "settings": _settings_of(run, stage),
             # What a stage noticed stands among its figures alone, and later ones repeat it.
             "before": {
                 name: one and (one["files"], one["figures"]) for name, one in before.items()
@@ -334,6 +347,12 @@ def _fingerprint(run: _Run, stage: Stage) -> str:
             "libraries": library_versions(),
         }
     )
+
+
+def _settings_of(run: _Run, stage: Stage) -> dict[str, Any]:
+    """The sections that a stage reads."""
+    settings = run.settings.model_dump(mode="json", by_alias=True)
+    return {name: settings[name] for name in stage.settings}
 
 
 def _described(study: Study, stage: Stage) -> dict[str, Any]:
@@ -371,7 +390,7 @@ def _entry(
     if measured is None:
         earlier = _earlier(run, name)
         same = earlier.get("fingerprint") == key
-        measured = {k: earlier.get(k) if same else None for k in ("seconds", "peak_memory_mb")}
+        measured = {k: earlier.get(k) if same else None for k in MEASURED}
     return {"status": status, "fingerprint": key, **measured, "figures": dict(figures)}
 
 
@@ -387,6 +406,8 @@ def _record(run: _Run, status: str) -> dict[str, Any]:
             "python": platform.python_version(),
             **library_versions(),
         },
+        "code": {stage.name: code_digest(f"pipeline.stages.{stage.name}") for stage in STAGES},
+        "networks": network_digests(),
         "settings": run.settings.model_dump(mode="json", by_alias=True),
         "inputs": run.inputs,
         "stages": _all_stages(run),

@@ -1,7 +1,7 @@
 """What products were made of: they are known by the content that made them.
 
-``stage.json`` in a product carries the fingerprint of all that went in (inputs, settings, code) and
-every file's digest, so a later run can tell whether the product still holds.
+``stage.json`` in a product carries the fingerprint of all that went in (inputs, settings, code),
+every file's digest and its own, so a later run can tell whether the product still holds.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
@@ -42,8 +43,13 @@ LIBRARIES = (
 
 PACKAGE = Path(__file__).parent
 
+NUMBERED = re.compile(r"_\d+\.(vtp|nii\.gz)$")
+"""How stages name a phase's file; copies that a person left beside them are called otherwise."""
 
-def seal(folder: Path, fingerprint: str, figures: Mapping[str, Any]) -> None:
+
+def seal(
+    folder: Path, fingerprint: str, figures: Mapping[str, Any], settings: Mapping[str, Any]
+) -> None:
     """Write ``stage.json``: what went in, what was measured, and every file's digest."""
     files = {
         path.relative_to(folder).as_posix(): {
@@ -53,23 +59,30 @@ def seal(folder: Path, fingerprint: str, figures: Mapping[str, Any]) -> None:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    write_json(
-        folder / STAGE_FILE,
-        {"fingerprint": fingerprint, "figures": dict(figures), "files": files},
-    )
+    content = {
+        "fingerprint": fingerprint,
+        "settings": dict(settings),
+        "figures": dict(figures),
+        "files": files,
+    }
+    write_json(folder / STAGE_FILE, {**content, "sha256": _own_digest(content)})
+
+
+def _own_digest(content: Mapping[str, Any]) -> str:
+    """SHA-256 of what ``stage.json`` says beside it, as it is read again."""
+    said = {name: value for name, value in content.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(json.loads(json.dumps(said))).encode()).hexdigest()
 
 
 def sealed(folder: Path) -> dict[str, Any] | None:
-    """What ``stage.json`` says, or None where a file of the product is missing or cut short."""
+    """What ``stage.json`` says, or None where it or a file of the product is missing."""
     try:
         content: dict[str, Any] = json.loads((folder / STAGE_FILE).read_text())
-        intact = all(
-            (folder / name).stat().st_size == entry["bytes"]
-            for name, entry in content["files"].items()
-        )
-    except (OSError, ValueError, KeyError, TypeError):
+        whole = all((folder / name).is_file() for name in content["files"])
+        whole = whole and {"fingerprint", "figures", "sha256"} <= set(content)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return content if intact else None
+    return content if whole else None
 
 
 def require_unaltered(folder: Path) -> None:
@@ -78,15 +91,30 @@ def require_unaltered(folder: Path) -> None:
     Raises
     ------
     InputError
-        When a file's digest is not that in ``stage.json``.
+        When a file's digest is not that in ``stage.json``, that one's own is wrong, or another file
+        is called as a phase's.
     """
     content = sealed(folder)
-    for name, entry in content["files"].items() if content else ():
-        if sha256_of(folder / name) != entry["sha256"]:
+    if content is None:
+        return
+    anew = f"to make it anew: beatfield run STUDY --out {folder.parent.parent} --from {folder.name}"
+    changed = [] if content["sha256"] == _own_digest(content) else [STAGE_FILE]
+    changed += [
+        name
+        for name, entry in content["files"].items()
+        if not changed and sha256_of(folder / name) != entry["sha256"]
+    ]
+    if changed:
+        raise InputError(
+            f"{folder / changed[0]}: is not what the stage {folder.name} wrote: it was edited, or "
+            f"damaged on the disk; {anew}"
+        )
+    named = (path for path in sorted(folder.iterdir()) if NUMBERED.search(path.name))
+    for path in named:
+        if path.name not in content["files"]:
             raise InputError(
-                f"{folder / name}: is not what the stage {folder.name} wrote: it was edited, or "
-                "damaged on the disk; to make it anew: beatfield run STUDY --out "
-                f"{folder.parent.parent} --from {folder.name}"
+                f"{path}: was not written by the stage {folder.name}, but is called as if it were; "
+                f"take it out, or {anew}"
             )
 
 
@@ -129,6 +157,18 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
+def digest_of_files(files: Mapping[str, str]) -> str:
+    """SHA-256 of what ``sha256sum`` prints of files, sorted by name in the order of bytes.
+
+    Parameters
+    ----------
+    files
+        SHA-256 of each, by its path in the study.
+    """
+    lines = [f"{files[name]}  {name}\n".encode() for name in sorted(files, key=str.encode)]
+    return hashlib.sha256(b"".join(lines)).hexdigest()
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file's bytes, as hexadecimal.
 
@@ -150,6 +190,12 @@ def sha256_of(path: Path) -> str:
 def library_versions() -> dict[str, str]:
     """Versions of the libraries that shape the products."""
     return {name: metadata.version(name) for name in LIBRARIES}
+
+
+@cache
+def network_digests() -> dict[str, str]:
+    """SHA-256 of the networks' weights by name."""
+    return {path.name: sha256_of(path) for path in sorted(PACKAGE.glob("*/weights/*.onnx"))}
 
 
 @cache

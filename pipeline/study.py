@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
@@ -32,7 +32,7 @@ from pipeline.study_folders import (
 from pipeline.validation import Section, describe_validation
 from pipeline.yaml_files import read_yaml
 
-PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]*"
+PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -71,8 +71,15 @@ class UltrasoundFiles(Section):
     probe_from_image: list[Row] | None = Field(None, min_length=4, max_length=4)
     """Calibration in place of the files' ImageToProbe: from pixels to the probe's marker, mm."""
 
-    pose_frame: str | None = Field(None, pattern="^[A-Za-z][A-Za-z0-9]*$")
+    pose_frame: str | None = None
     """Name of the marker or device in whose frame poses are taken, such as Reference."""
+
+    @field_validator("pose_frame")
+    @classmethod
+    def _named_as_in_sequences(cls, name: str | None) -> str | None:
+        if name is not None and not re.fullmatch("[A-Za-z][A-Za-z0-9]*", name):
+            raise ValueError("needs letters and digits alone, a letter first, as Reference has")
+        return name
 
 
 class Described(Section):

@@ -33,6 +33,20 @@ class _Loader(yaml.SafeLoader):
             lines[name] = line
         return super().construct_mapping(node, deep)
 
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """A whole number; not one that a person writes to mean another than YAML 1.1 reads."""
+        text = str(node.value).lstrip("+-")
+        if ":" in text or (text[:1] == "0" and text[1:2].isdigit()):
+            raise InputError(
+                f"{self.name}: line {node.start_mark.line + 1}: {node.value} would be read as "
+                f"{super().construct_yaml_int(node)}; write it without the leading zero or colon, "
+                "or in quotes where it is text"
+            )
+        return super().construct_yaml_int(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
 
 def read_yaml(path: Path) -> Any:
     """What a YAML file holds; None where it is empty.

@@ -19,6 +19,7 @@ from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
 from pipeline.field.spline import phase_weights, timeline
 from pipeline.field.tool import Needle, Polyline, outside_share
+from pipeline.field.verify import verify_field
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler")
 
@@ -403,6 +404,25 @@ def test_numbers_are_read_as_python_reads_them(path, program):
     assert str(found[len(numbers) + 1]) == "-0.0"
     for bad in ("-", "1e", "e5", ".", "x"):
         assert run(program, path, "numbers", given=bad.encode()).stdout.split()[-1] == b"1"
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (
+            {"use": "x", "patient_id": "patient-0007", "inputs": {"patient_id": "no"}},
+            "patient-0007",
+        ),
+        ({"patient_id": "A" * 100}, "A" * 63),
+        ({"shape": "ball"}, ""),
+        ({}, ""),
+    ],
+)
+def test_c_is_told_whose_field_it_is(path, program, tmp_path, source, said):
+    named = described(path, tmp_path / "f.zarr", source=source)
+    assert run(program, named, "patient").stdout.decode() == f"{said}\n"
+    words = str(verify_field(named))
+    assert words.startswith(f"whole, of {source['patient_id']}: " if said else "whole: ")
 
 
 def test_a_tool_of_which_a_number_is_none_is_nowhere(path, program):

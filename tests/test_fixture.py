@@ -1,5 +1,6 @@
 """Fixtures: widths, stiffness, devices, and what is refused."""
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -77,7 +78,7 @@ def test_gamma_and_delta_describe_the_same_fixture():
         ({"side": "inside"}, "side belongs to a forbidden_region"),
         ({"f_max_n": 3.4}, r"3.4 N is beyond the touch, which exerts 3.3 N"),
         ({"f_max_n": 9.0, "device": "falcon"}, "beyond the falcon"),
-        ({"f_max_n": 0}, "greater than 0"),
+        ({"f_max_n": 0}, "greater than or equal to 0.001"),
         ({"m": 0}, "greater than or equal to 1"),
         ({"m": 1.5}, "valid integer"),
         ({"delta_mm": float("nan")}, "finite number"),
@@ -95,8 +96,13 @@ def test_wrong_fixtures_are_refused(changes, words):
         fixture(**changes)
 
 
+def gamma_of(delta_mm: float, m: int) -> float:
+    """The distance at which a potential of this width is 0.01: the law, solved for it."""
+    return delta_mm * math.sqrt(2) * (-math.log(0.99)) ** (1 / (2 * m))
+
+
 @given(
-    st.floats(0.1, 3.3),
+    st.floats(1.0, 3.3),
     st.integers(1, 5),
     st.sampled_from(["delta_mm", "gamma_mm"]),
     st.sampled_from(["touch", "omega7"]),
@@ -104,20 +110,38 @@ def test_wrong_fixtures_are_refused(changes, words):
 def test_too_stiff_names_the_smallest_width_that_would_do(force, m, key, device):
     others = {"delta_mm": None, "f_max_n": force, "m": m, "device": device}
     with pytest.raises(ValidationError, match="stiffer than") as refusal:
-        fixture(**{**others, key: 1e-3})
+        fixture(**{**others, key: 0.1 if key == "delta_mm" else gamma_of(0.1, m)})
     named = float(str(refusal.value).split(f"{key} = ")[1].split()[0].rstrip(","))
 
     allowed = fixture(**{**others, key: named})
 
     assert allowed.stiffness_n_per_m <= DEVICES[device].stiffness_n_per_m * (1 + 1e-9)
     # Named to a thousandth of a millimetre, rounded up: 0.002 less is too little.
-    if named > 0.003:
-        with pytest.raises(ValidationError, match="stiffer than"):
-            fixture(**{**others, key: named - 0.002})
+    with pytest.raises(ValidationError, match=r"stiffer than|0\.1 to 1000"):
+        fixture(**{**others, key: named - 0.002})
 
 
 def test_the_falcon_has_no_known_stiffness_limit():
-    assert fixture(device="falcon", delta_mm=0.01).stiffness_n_per_m > 1e5
+    assert fixture(device="falcon", delta_mm=0.1).stiffness_n_per_m > 1e4
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"delta_mm": 1e-170, "device": "falcon"},
+        {"delta_mm": 0.01, "device": "falcon"},
+        {"delta_mm": 1e308},
+        {"delta_mm": None, "gamma_mm": 5e-324},
+        {"delta_mm": None, "gamma_mm": 1e-3, "m": 20, "device": "falcon"},
+        {"delta_mm": None, "gamma_mm": 900.0},
+        {"delta_mm": None, "gamma_mm": 2.0, "gamma_level": 1e-300},
+        {"f_max_n": 5e-324},
+        {"f_max_n": 1e300, "device": {"name": "m", "force_n": 1e308, "stiffness_n_per_m": None}},
+    ],
+)
+def test_widths_and_forces_of_no_hand_and_no_heart_are_refused(changes):
+    with pytest.raises(ValidationError):
+        fixture(**changes)
 
 
 def test_settings_do_not_change_and_know_their_keys():

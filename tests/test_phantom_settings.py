@@ -67,6 +67,19 @@ def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_section_of_comments_alone_is_the_default(tmp_path):
+    (tmp_path / "p.yaml").write_text("seed: 4\nmr:\n  # pixel_mm: 2\n")
+    assert read_settings(tmp_path / "p.yaml") == PhantomSettings(seed=4)
+
+
+def test_a_second_file_of_settings_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "o"), "--config", "a.yaml", "--config", "b.yaml"])
+    assert ended.value.code == 2
+    assert "given a second time" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
 def test_settings_that_are_not_there_are_told(tmp_path):
     with pytest.raises(SynthError, match=r"none\.yaml: no such file"):
         read_settings(tmp_path / "none.yaml")

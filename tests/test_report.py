@@ -470,8 +470,12 @@ def test_the_page_tells_what_it_was_made_of_as_sha256sum_does(tmp_path: Path) ->
     section = provenance({"cine": digests, "us": {}}, settings, tmp_path / "manifest.json")
     files, changed, software = section.tables
     of_cine = printed("sha256sum cine/* | LC_ALL=C sort -k 2 | sha256sum").split()[0]
-    assert files.rows == [
-        ("cine", "2 files", of_cine),
+    *networks, manifest = files.rows[1:]
+    assert files.rows[0] == ("cine", "2 files", of_cine)
+    for name, _, digest in networks:
+        (path,) = Path(render.__code__.co_filename).parents[1].rglob(name.split()[1])
+        assert printed(f"sha256sum {path}").split()[0] == digest
+    assert [manifest] == [
         ("bake/field.zarr/manifest.json", "1 file", printed("sha256sum manifest.json").split()[0]),
     ]
     assert changed.rows == [("register.min_frames", "7", "10"), ("bake.spacing_mm", "2.5", "1.5")]

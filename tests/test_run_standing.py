@@ -14,6 +14,7 @@ from pipeline import run as runner
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
+from pipeline.publish import stale_words
 
 CHANGED = Settings.model_validate({"bake": {"spacing_mm": 3.0}})
 """Settings that only the second stage reads."""
@@ -54,18 +55,55 @@ def test_nothing_is_made_of_a_product_that_was_altered(kitchen: Kitchen) -> None
     assert kitchen.text("c") == "c(a(first),b(a(first)))"
 
 
-def test_an_altered_product_does_not_stand(kitchen: Kitchen) -> None:
+@pytest.mark.parametrize("by_hand", ["f1rst", "corrected", ""], ids=["same size", "longer", "cut"])
+def test_an_altered_product_does_not_stand(kitchen: Kitchen, by_hand: str) -> None:
     """It is not made anew unasked either: somebody may have corrected it by hand."""
     kitchen.run()
     text = kitchen.out / "p1" / "c" / "text"
-    text.write_text(text.read_text().replace("first", "f1rst"))
+    text.write_text(text.read_text().replace("first", by_hand))
     out = kitchen.out
     with pytest.raises(InputError, match=rf"c/text: is not what .* --out {out} --from c") as caught:
         kitchen.run()
     assert not getattr(caught.value, "__notes__", [])
     assert statuses(kitchen) == {"a": "done", "b": "done", "c": "failed"}
-    assert "f1rst" in text.read_text()
+    assert by_hand in text.read_text() != "c(a(first),b(a(first)))"
     assert kitchen.run(first="c") == {"a": "unchanged", "b": "unchanged", "c": "done"}
+
+
+def test_what_a_stage_did_not_write_is_not_read_as_its_own(kitchen: Kitchen) -> None:
+    """Such as a surface of another patient, where this one's images show none."""
+    kitchen.run()
+    foreign = kitchen.out / "p1" / "a" / "left_atrium_000.vtp"
+    foreign.write_text("another heart")
+    words = r"left_atrium_000\.vtp: was not written by the stage a"
+    for first in ("b", None):
+        with pytest.raises(InputError, match=words):
+            kitchen.run(first=first)
+    foreign.rename(foreign.with_name("left_atrium_000 of another.vtp"))
+    assert kitchen.run() == dict.fromkeys("abc", "unchanged")
+
+
+def test_figures_that_were_edited_are_not_told(kitchen: Kitchen) -> None:
+    """The report repeats them, and later stages are made by them."""
+    kitchen.run()
+    told = kitchen.out / "p1" / "a" / "stage.json"
+    told.write_text(told.read_text().replace('"figure": 1.5', '"figure": 1.25'))
+    with pytest.raises(InputError, match=r"a/stage\.json: is not what the stage a wrote"):
+        kitchen.run()
+    assert kitchen.run(first="a")["c"] == "done"
+
+
+def test_a_product_says_which_settings_made_it(kitchen: Kitchen) -> None:
+    """Also when the last command had others, and did not come to it."""
+    kitchen.run(Settings.model_validate({"bake": {"samples": 123}}))
+    kitchen.run(Settings(), last="a")
+    record = kitchen.record()
+    assert record["settings"]["bake"]["samples"] == 500
+    assert record["stages"]["b"]["status"] == "stale"
+    said = json.loads((kitchen.out / "p1" / "b" / "stage.json").read_text())
+    assert said["settings"]["bake"]["samples"] == 123
+    assert set(said["settings"]) == {"bake"}
+    assert record["stages"]["a"]["finished"].endswith("+00:00")
 
 
 def test_what_holds_is_not_called_old_by_a_failure(kitchen: Kitchen) -> None:
@@ -192,3 +230,17 @@ def test_files_that_vanish_while_the_study_runs_are_told(kitchen: Kitchen, left:
     with pytest.raises(InputError, match=r"(image|heart\.nii): changed while the study ran"):
         kitchen.run()
     assert not (kitchen.out / "p1" / "a").exists()
+
+
+def test_a_field_of_an_earlier_run_is_told(kitchen: Kitchen, tmp_path: Path) -> None:
+    products = kitchen.out / "p1"
+    field = products / "bake" / "field.zarr"
+    field.mkdir(parents=True)
+    assert stale_words(field) == ""
+    for status, told in (("done", False), ("stale", True), ("failed", True), ("running", True)):
+        (products / "run.json").write_text(json.dumps({"stages": {"bake": {"status": status}}}))
+        assert bool(stale_words(field)) == told
+        assert stale_words(products / "field.zarr") == ""
+    for other in ("[]", '{"stages": 1}', '{"stages": {"bake": []}}', "{"):
+        (products / "run.json").write_text(other)
+        assert stale_words(field) == ""

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField
+from pipeline.field.verify import verify_field
 from pipeline.imaging.ecg import Ecg, read_ecg
 from pipeline.registration.clock import PhaseClock
 from pipeline.registration.rhythm import tell
@@ -58,6 +59,8 @@ def main(words: list[str]) -> int:
         sys.stderr.write("use: server.py FIELD ECG X Y Z (LPS mm)\n")
         return 2
     try:
+        # Opening reads no values: a damaged one would be a wrong force without a word.
+        verify_field(Path(path))
         field, tip_mm = ForceField.open(path), (x_mm, y_mm, z_mm)
         if not field.contains([tip_mm])[0]:
             raise InputError(f"{path}: its grid does not hold the point; give one near the heart")

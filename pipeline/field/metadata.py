@@ -14,6 +14,8 @@ from pipeline.field.fixture import DEVICES, Device, Fixture, Kind, Side
 from pipeline.geometry import Grid, require_rigid
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+LONGEST_NAME = 63
+"""What the C header has room for, too."""
 
 Row = tuple[float, float, float, float]
 Transform = tuple[Row, Row, Row, Row]
@@ -241,7 +243,8 @@ def require_phases(phases: list[float], where: str) -> None:
 
 def require_name(name: str, what: str) -> None:
     """Raise InputError unless a name can be a folder everywhere."""
-    if not NAME.fullmatch(name):
+    if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
         raise InputError(
-            f"{what} name {name!r}: needs letters, digits, '_' and '-', a letter or digit first"
+            f"{what} name {name!r}: needs letters, digits, '_' and '-', a letter or digit first, "
+            f"{LONGEST_NAME} of them at most"
         )

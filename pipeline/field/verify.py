@@ -54,6 +54,9 @@ class Report:
     phases: int
     """Stored phases."""
 
+    patient_id: str
+    """Whose field it is; empty where not told."""
+
     structures: tuple[str, ...]
     """Surfaces whose distances are all finite."""
 
@@ -62,7 +65,8 @@ class Report:
 
     def __str__(self) -> str:
         return (
-            f"whole: {self.files} files, {self.bytes / 1e6:.1f} MB, {self.phases} phases, "
+            f"whole{f', of {self.patient_id}' if self.patient_id else ''}: {self.files} files, "
+            f"{self.bytes / 1e6:.1f} MB, {self.phases} phases, "
             f"structures {', '.join(self.structures)}; fixtures {', '.join(self.fixtures)}"
         )
 
@@ -103,6 +107,7 @@ def _verified(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Report:
         files=len(files),
         bytes=sum(one["size"] for one in files.values()),
         phases=len(metadata.phases),
+        patient_id=str(metadata.source.get("patient_id", "")),
         structures=tuple(metadata.structures),
         fixtures=tuple(metadata.fixtures),
     )

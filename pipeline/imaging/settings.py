@@ -24,7 +24,7 @@ class SegmentSettings(Section):
     min_confidence: float = Field(0.4, ge=0, le=1)
     """An image whose labels are trusted less counts as not understood and fails the stage."""
 
-    min_ventricle_ml: float = Field(30.0, gt=0)
+    min_ventricle_ml: float = Field(30.0, gt=0, le=1000)
     """A left ventricle (cavity and muscle) smaller than this counts as not found."""
 
     grid_mm: float = Field(1.5, ge=0.5, le=4)

@@ -16,7 +16,7 @@ class RegisterSettings(Section):
     """Fewer frames than this are refused: they do not fix six degrees of freedom."""
     max_frames: int = Field(60, ge=10)
     """More frames than this are thinned evenly while the pose is sought; all are judged at it."""
-    sample_spacing_mm: float = Field(4.0, gt=0, le=10)
+    sample_spacing_mm: float = Field(4.0, ge=0.5, le=10)
     """Distance between the pixels that are compared, in the plane of a frame."""
     smoothing_mm: float = Field(1.5, gt=0, le=10)
     """Standard deviation of the smoothing that takes out speckle; the model is blurred alike."""
@@ -26,7 +26,7 @@ class RegisterSettings(Section):
     trend_mm: float = Field(20.0, gt=0, le=200)
     """What changes over longer ways than this, across a frame, is taken for gain, shadow and haze,
     and is not looked at; three or more sample spacings."""
-    grid_mm: float = Field(2.0, gt=0, le=5)
+    grid_mm: float = Field(2.0, ge=0.5, le=5)
     """Node spacing of the grid on which the model's tissues are drawn."""
     capture_mm: float = Field(20.0, gt=0, le=60)
     """How far off the start may be: wider makes the search sparser. A solution half as far away

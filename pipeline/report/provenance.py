@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from pipeline import __version__
 from pipeline.config import Settings
 from pipeline.report.page import Section, Table
-from pipeline.sealing import library_versions, sha256_of
+from pipeline.sealing import digest_of_files, library_versions, network_digests, sha256_of
 
 TOLD = (
     "The same files, settings and versions give the same products. The digest of several files is "
@@ -39,6 +38,7 @@ def provenance(
         for kind, name in KINDS.items()
         if inputs.get(kind)
     ]
+    files += [(f"network {name}", "1 file", digest) for name, digest in network_digests().items()]
     files.append(("bake/field.zarr/manifest.json", "1 file", sha256_of(manifest)))
     versions = {"beatfield": __version__, "Python": platform.python_version(), **library_versions()}
     return Section(
@@ -50,18 +50,6 @@ def provenance(
             Table(("software", "version"), list(versions.items())),
         ],
     )
-
-
-def digest_of_files(files: Mapping[str, str]) -> str:
-    """SHA-256 of what ``sha256sum`` prints of files, sorted by name in the order of bytes.
-
-    Parameters
-    ----------
-    files
-        SHA-256 of each, by its path in the study.
-    """
-    lines = [f"{files[name]}  {name}\n".encode() for name in sorted(files, key=str.encode)]
-    return hashlib.sha256(b"".join(lines)).hexdigest()
 
 
 def _count(files: Mapping[str, str]) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline import __version__
+from pipeline import INTENDED_USE, __version__
 from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
 from pipeline.field.certificate import allowed_errors
@@ -15,6 +15,7 @@ from pipeline.field.fixture import DEFAULT_FIXTURES, Fixture
 from pipeline.geometry import MovingSurface
 from pipeline.job import Job
 from pipeline.products import read_surfaces, read_table
+from pipeline.sealing import digest_of_files, network_digests
 
 if TYPE_CHECKING:
     from pipeline.config import Settings
@@ -30,7 +31,15 @@ def run(job: Job) -> dict[str, Any]:
     lost = job.figures("surface")["left_out"]
     fixtures, left_out = fixtures_for(job.settings, surfaces, lost)
     registered = job.product("register")
-    source: dict[str, Any] = {"patient_id": job.study.patient_id, "beatfield": __version__}
+    source: dict[str, Any] = {
+        "use": INTENDED_USE,
+        "patient_id": job.study.patient_id,
+        "beatfield": __version__,
+        "inputs": {kind: digest_of_files(files) for kind, files in job.inputs.items() if files},
+        "networks": network_digests(),
+        "bake": job.settings.bake.model_dump(mode="json"),
+        "fingerprint": job.fingerprint,
+    }
     mr_from_tracker = None
     if registered:
         found = read_table(registered / "mr_from_tracker.json")

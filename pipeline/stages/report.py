@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import __version__
+from pipeline import INTENDED_USE, __version__
 from pipeline.field.fixture import Fixture
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.reader import ForceField
@@ -197,7 +197,7 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
         where = "NOT REGISTERED: not for use with a tracker; a field in the frame of the MR alone."
     many = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
     found = f"{many}, to be read first." if warnings else "No warnings from the program's checks."
-    told = ["Research software: not a medical device, and not for use on patients."]
+    told = [f"{INTENDED_USE[0].upper()}{INTENDED_USE[1:]}."]
     if job.product("evaluate"):
         told.append(
             "This study comes with a truth to be compared with (the last section), as synthetic "

@@ -89,6 +89,7 @@ typedef struct {
     double *phase;       /* stored phases, rising in [0, 1) */
     double *line;        /* four numbers a phase: where which weights hold */
     double rr_s;         /* heartbeat when the images were taken; 0 where unknown */
+    char patient_id[BF_NAME]; /* whose field it is; its beginning where longer, empty where not told */
     int registered;      /* whether mr_from_tracker is known */
     double mr_from_tracker[16]; /* where it is not known: not numbers, so that no question succeeds */
     int structures, fixtures;
@@ -732,6 +733,24 @@ static int bf__find(bf__json *j, const char *name)
     return 0;
 }
 
+static void bf__source(bf__json *j, bf_field *field)
+{
+    const char *key, *text;
+    size_t length;
+    int first = 1;
+    while (bf__key(j, &first, &key, &length)) {
+        if (!bf__is(key, length, "patient_id")) {
+            bf__skip(j, 0);
+            continue;
+        }
+        bf__string(j, &text, &length);
+        if (j->bad) return;
+        if (length > BF_NAME - 1) length = BF_NAME - 1;
+        memcpy(field->patient_id, text, length);
+        field->patient_id[length] = 0;
+    }
+}
+
 bf_status bf_describe(bf_field *field, const char *text, size_t length)
 {
     bf__json j, parts;
@@ -761,6 +780,7 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
             j.bad |= j.end - j.at < 4 || memcmp(j.at, "true", 4) != 0;
             bf__skip(&j, 0);
         }
+        else if (bf__is(key, span, "source")) bf__source(&j, field);
         else if (bf__is(key, span, "mr_from_tracker")) bf__transform(&j, field);
         else if (bf__is(key, span, "grid")) {
             bf__grid(&j, field);
