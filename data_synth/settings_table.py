@@ -1,6 +1,6 @@
-"""Every setting of the phantom with its default, limits and meaning, as a Markdown table.
+"""Every setting of a model with its default, limits and meaning, as a Markdown table.
 
-`python -m data_synth.settings_table` prints it; `docs/phantom.md` holds it.
+`python -m data_synth.settings_table` prints the phantom's; `docs/phantom.md` holds it.
 """
 
 from __future__ import annotations
@@ -14,33 +14,47 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
 
 from data_synth.settings import PhantomSettings
 
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
-def settings_table() -> str:
+def settings_table(model: type[BaseModel] = PhantomSettings) -> str:
     """The whole table; keys are written as ``section.key``."""
     lines = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
-    for key, default, allowed, meaning in _rows(PhantomSettings(), ""):
+    for key, default, allowed, meaning in _rows(model, ""):
         lines.append(f"| `{key}` | {default} | {allowed} | {meaning} |")
     return "\n".join(lines) + "\n"
 
 
-def _rows(settings: BaseModel, head: str) -> Iterator[tuple[str, str, str, str]]:
-    kind = type(settings)
-    meanings = attribute_docstrings(kind)
-    for name, field in kind.model_fields.items():
-        value = getattr(settings, name)
-        if isinstance(value, BaseModel):
-            yield from _rows(value, f"{head}{name}.")
+def _rows(
+    model: type[BaseModel], head: str, given: BaseModel | None = None
+) -> Iterator[tuple[str, str, str, str]]:
+    meanings = attribute_docstrings(model)
+    for name, field in model.model_fields.items():
+        key = f"{head}{field.alias or name}"
+        value = getattr(given, name) if given else field.get_default()
+        below = [one for one in (field.annotation, *get_args(field.annotation)) if _is_model(one)]
+        if isinstance(value, dict) and below:
+            yield from _rows(below[0], f"{key}.NAME.")
+        elif below and all(not one.is_required() for one in below[0].model_fields.values()):
+            yield from _rows(below[0], f"{key}.", value)
         else:
             meaning = meanings.get(name, "").replace("|", "\\|")
-            yield f"{head}{name}", _default(value), _allowed(field), meaning
+            yield key, _default(value), _allowed(field), meaning
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
 def _default(value: Any) -> str:
+    if value is PydanticUndefined:
+        return "to be given"
+    if isinstance(value, BaseModel):
+        return str(getattr(value, "name", value))
     if isinstance(value, tuple):
         return ", ".join(str(one) for one in value) or "none"
     if isinstance(value, float):

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from data_synth.settings_table import settings_table
 from pipeline.cli import main
+from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.summary import summary
 
@@ -117,6 +119,10 @@ def test_a_wrong_command_ends_with_exit_code_2(
             "fixtures: {a b: {structure: aorta, kind: guidance, delta_mm: 9, f_max_n: 1}}",
             "fixtures: fixture name 'a b': needs letters, digits",
         ),
+        ("bake: {margin_mm: 020}", "line 1: 020 would be read as 16; write it without"),
+        ("segment: {margin_mm: 1:30}", "1:30 would be read as 90"),
+        (f"fixtures: {{{'n' * 64}: {{}}}}", "fixtures"),
+        ("bake: {samples: 3000000000}", "bake.samples: Input should be less than or equal to"),
         ("a: [", "cannot be read as YAML"),
         ("segment:\n\tmost_views: 2\n", "spaces in the place of tabs"),
         ("7", "needs sections"),
@@ -166,6 +172,14 @@ def test_surfaces_of_ones_own_have_names_of_ones_own(
     assert main(arguments) == 0
     assert "no structure" not in capsys.readouterr().err
     assert (out / "field.zarr").is_dir()
+
+
+def test_the_page_of_settings_has_every_key_with_its_range() -> None:
+    # `settings_table(Settings)` is what belongs there.
+    assert (
+        settings_table(Settings)
+        in (Path(__file__).parent.parent / "docs" / "settings.md").read_text()
+    )
 
 
 def test_the_default_configuration_file_says_what_the_code_says() -> None:

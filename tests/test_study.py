@@ -394,6 +394,7 @@ def test_a_folder_whose_name_is_no_patient_id_is_refused(tmp_path: Path) -> None
     ("yaml", "words"),
     [
         ("cien: {path: cine}", r"cien: unknown key; did you mean cine\?"),
+        ("us: {pose_frame: my_marker}", r"us\.pose_frame: needs letters and digits alone"),
         ("us: {sweps: [us/sweep_000.mha]}", r"us.sweps: unknown key; did you mean sweeps\?"),
         ("qwerty: 1", "qwerty: unknown key; check its spelling"),
         ("rr_ms: 800", "rr_ms: unknown key; it belongs under cine"),

@@ -105,7 +105,8 @@ class Fixture(Section):
     """Force far from the floor of the well."""
 
     device: Device = DEVICES["touch"]
-    """The haptic device that will render the force: a name of `DEVICES`, or one of one's own."""
+    """The haptic device that will render the force: touch, falcon, omega7, or one of one's own,
+    as {name: mine, force_n: 10, stiffness_n_per_m: 2000}; null where no stiffness is known."""
 
     @field_validator("device", mode="before")
     @classmethod
