@@ -415,6 +415,7 @@ def test_numbers_are_read_as_python_reads_them(path, program):
         ),
         ({"patient_id": "A" * 100}, "A" * 63),
         ({"shape": "ball"}, ""),
+        ({"patient_id": None}, ""),
         ({}, ""),
     ],
 )

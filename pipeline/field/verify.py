@@ -107,7 +107,7 @@ def _verified(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Report:
         files=len(files),
         bytes=sum(one["size"] for one in files.values()),
         phases=len(metadata.phases),
-        patient_id=str(metadata.source.get("patient_id", "")),
+        patient_id=str(metadata.source.get("patient_id") or ""),
         structures=tuple(metadata.structures),
         fixtures=tuple(metadata.fixtures),
     )

@@ -739,7 +739,8 @@ static void bf__source(bf__json *j, bf_field *field)
     size_t length;
     int first = 1;
     while (bf__key(j, &first, &key, &length)) {
-        if (!bf__is(key, length, "patient_id")) {
+        bf__blank(j);
+        if (!bf__is(key, length, "patient_id") || j->at >= j->end || *j->at != '"') {
             bf__skip(j, 0);
             continue;
         }
