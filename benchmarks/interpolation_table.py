@@ -305,8 +305,9 @@ def main() -> None:
     rng = np.random.default_rng(chosen.seed)
     heart = draw_heart(rng, pathology=chosen.pathology, heart_rate_bpm=chosen.rate)
     every = np.arange(chosen.phases) / chosen.phases
+    name = chosen.structure
     surfaces, between = (
-        [Surface(*heart.surfaces(float(phase))[chosen.structure]) for phase in phases]
+        [Surface(*heart.surfaces(float(phase), [name])[name]) for phase in phases]
         for phases in (every, every + 0.5 / chosen.phases)
     )
     for spacing_mm in chosen.spacing:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from data_synth.anatomy import BOX_MM, label_points
+from data_synth.anatomy import BODY_NAMES, BOX_MM, label_points
 from data_synth.beat import (
     PLACES,
     Amounts,
@@ -180,18 +181,20 @@ class BeatingHeart:
         """Tissue of LPS points (n, 3) with the heart left out: the same at every phase."""
         return chest_points(np.ascontiguousarray(points_mm, float), self.chest)
 
-    def surfaces(self, phase: float) -> dict[str, Mesh]:
+    def surfaces(self, phase: float, names: Collection[str] = BODY_NAMES) -> dict[str, Mesh]:
         """Closed truth meshes, normals outwards: name -> (LPS vertices (n, 3), triangles (m, 3)).
 
-        Names: lv_endocardium, epicardium, rv_endocardium, left_atrium, right_atrium, aorta,
-        heart. ``epicardium`` is the outside of the left muscle, closed by the mitral plane;
-        ``heart`` the outside of all labelled parts, clefts filled, without the thin outer walls.
+        Those of ``names``, which are lv_endocardium, epicardium, rv_endocardium, left_atrium,
+        right_atrium, aorta, heart. ``epicardium`` is the outside of the left muscle, closed by the
+        mitral plane; ``heart`` the outside of all labelled parts, clefts filled, without the thin
+        outer walls.
         Vertex i is the same material point in every phase.
         """
         beat = self.beat(phase)
         return {
             name: (self.into_patient(carry_points(vertices, self.shape, beat)), triangles)
             for name, (vertices, triangles) in reference_meshes(self.shape).items()
+            if name in names
         }
 
     def volumes_ml(self, phase: float) -> dict[str, float]:

@@ -117,7 +117,7 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     structure = "left_atrium"
     heart = draw_heart(np.random.default_rng(11), pathology="enlarged_atrium", heart_rate_bpm=70.0)
     phases = np.arange(25) / 25
-    each = [heart.surfaces(float(phase))[structure] for phase in phases]
+    each = [heart.surfaces(float(phase), [structure])[structure] for phase in phases]
     moving = MovingSurface(np.stack([one[0] for one in each]), each[0][1], phases)
     fixture = Fixture(structure=structure, kind="guidance", delta_mm=8.0, f_max_n=1.0)
     settings = BakeSettings(samples=100)
@@ -128,7 +128,7 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     assert 0 < stated_mm <= settings.spacing_mm
     off = []
     for moment in np.concatenate([(phases + 0.02)[::5], (phases + 0.011)[2::5]]):
-        vertices_mm, triangles = heart.surfaces(float(moment))[structure]
+        vertices_mm, triangles = heart.surfaces(float(moment), [structure])[structure]
         asked = np.concatenate([vertices_mm, vertices_mm[triangles].mean(axis=1)])
         off.append(np.abs(field.distance_mm(asked, moment)))
     off_mm = np.concatenate(off)

@@ -204,7 +204,7 @@ def test_septal_segments_lie_between_the_attachments_of_the_right_ventricle(path
     ventricle half-way up: the two septal segments lie evenly about the middle of that."""
     heart = draw_heart(np.random.default_rng(6), pathology=pathology)
     inner, outer, right = (
-        Surface(*heart.surfaces(0.0)[name])
+        Surface(*heart.surfaces(0.0, [name])[name])
         for name in ("lv_endocardium", "epicardium", "rv_endocardium")
     )
     axis = base_direction(inner, outer)
