@@ -19,11 +19,14 @@ WORKERS ?= 2
 
 # Rules read them as "$$STUDY", for names may hold spaces and quotes; Make itself takes $$ for $.
 export STUDY OUT STUDIES CONFIG
-$(foreach one,STUDY OUT STUDIES CONFIG,$(if $(strip $($(one))),,$(error $(one)= is empty: give it a value)))
 # A study of one's own is there, and Make knows no names with spaces.
 DEMO_STUDY := $(if $(filter-out $(DEMO),$(STUDY)),$(READY),$(DEMO)/study.yaml)
 
 STAGES := ingest segment surface register bake evaluate report
+
+ifneq (,$(filter demo batch $(STAGES),$(MAKECMDGOALS)))
+$(foreach one,STUDY OUT STUDIES CONFIG,$(if $(strip $($(one))),,$(error $(one)= is empty: give it a value)))
+endif
 
 # Stages of one study follow each other, and demo studies are made once.
 .NOTPARALLEL:

@@ -116,8 +116,13 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     if not isinstance(content, dict):
         raise SynthError(f"{where}: needs keys and values, such as `spread: 1.0`")
     # Nor does a section of which all keys are commented out.
-    sections = {name: {} if value is None else value for name, value in content.items()}
+    sections = {
+        name: {} if value is None and name in SECTIONS else value for name, value in content.items()
+    }
     return check_settings({**sections, **(changes or {})}, where)
+
+
+SECTIONS = ("mr", "ecg", "ultrasound")
 
 
 def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:

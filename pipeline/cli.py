@@ -46,7 +46,10 @@ Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults 
 
 def _whole(_type: type[int], tokens: Sequence[Token]) -> int:
     """The parser's own way rounds 1.5 to 2."""
-    return int(tokens[0].value)
+    text = tokens[0].value
+    if not text.lstrip("+-").isdecimal():
+        raise ValueError(f"needs a whole number, got {text}")
+    return int(text)
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]

@@ -16,6 +16,12 @@ from pipeline.surface.settings import SurfaceSettings
 from pipeline.validation import Section, describe_validation
 from pipeline.yaml_files import read_yaml
 
+WIDTHS_MM = (0.1, 1000.0)
+"""Of a potential: below, a force rises within what its steps are measured over, and within the
+error of the surface itself; above, there is none anywhere near a heart."""
+
+FORCES_N = (1e-3, 1000.0)
+
 
 class Settings(Section):
     """Everything that a user can set."""
@@ -32,6 +38,22 @@ class Settings(Section):
     def _has_a_fixture(cls, fixtures: dict[str, Fixture]) -> dict[str, Fixture]:
         if not fixtures:
             raise ValueError("at least one fixture is needed; leave the key out for the default")
+        return fixtures
+
+    @field_validator("fixtures")
+    @classmethod
+    def _can_be_felt(cls, fixtures: dict[str, Fixture]) -> dict[str, Fixture]:
+        """A store may hold what other hands and hearts made use of; a new one may not."""
+        for name, one in fixtures.items():
+            for what, value, (least, most) in (
+                ("delta_mm", one.resolved_delta_mm, WIDTHS_MM),
+                ("f_max_n", one.f_max_n, FORCES_N),
+            ):
+                if not least <= value <= most:
+                    raise ValueError(
+                        f"{name}: {what} is {value:.3g}, given or by gamma_mm; needs "
+                        f"{least:g} to {most:g}"
+                    )
         return fixtures
 
     @field_validator("fixtures")

@@ -22,7 +22,7 @@ from pipeline.field.certificate import BAND_MM, certify, require_bounds
 from pipeline.field.distance import require_closed
 from pipeline.field.files import read_metadata
 from pipeline.field.fixture import BakeSettings, Fixture
-from pipeline.field.metadata import Transform, require_name, require_phases
+from pipeline.field.metadata import LONGEST_NAME, Transform, require_name, require_phases
 from pipeline.field.reader import ForceField
 from pipeline.field.winding import winding_number
 from pipeline.geometry import Surface, require_rigid
@@ -215,7 +215,7 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
         When the field is out of the bounds that it was baked to, or else the default ones.
     """
     field = ForceField.open(path)
-    settings = BakeSettings.model_validate(field.source.get("bake", {}))
+    settings = _baked_with(field)
     count = len(field.phases)
     own = read_own_surfaces(folder, field.structures, count)
     _require_same_surfaces(folder, own, path, field)
@@ -240,6 +240,19 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
         )
     require_bounds(accuracy, settings.bounds, min(field.grid.spacing_mm))
     return accuracy
+
+
+def _baked_with(field: ForceField) -> BakeSettings:
+    """How a field is to be measured: as its source says, or by default where that says nothing
+    that this version knows."""
+    said = field.source.get("bake")
+    known = (
+        {name: said.get(name) for name in ("samples", "bounds")} if isinstance(said, dict) else {}
+    )
+    try:
+        return BakeSettings.model_validate({k: one for k, one in known.items() if one is not None})
+    except ValidationError:
+        return BakeSettings()
 
 
 def _require_same_surfaces(folder: Path, own: OwnSurfaces, path: Path, field: ForceField) -> None:
@@ -366,7 +379,8 @@ def _files_by_structure(folder: Path) -> dict[str, list[Path]]:
             "STRUCTURE_001.vtp ..., one a phase; save others, such as OBJ, as one of these"
         )
     for structure, phases in found.items():
-        require_name(structure, f"{folder}: structure")
+        # A fixture of its own is called after it.
+        require_name(structure, f"{folder}: structure", LONGEST_NAME - len("_guidance"))
         missing = sorted(set(range(len(phases))) - set(phases))
         if missing:
             raise InputError(

@@ -17,7 +17,7 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import NOT_TO_BE_USED, InputError
+from pipeline.errors import InputError
 from pipeline.regular_files import require_text_name
 
 PARTIAL = ".partial-"
@@ -245,14 +245,15 @@ def read_record(products: Path | None) -> dict[str, Any]:
 def stale_words(field: Path) -> str:
     """That a field is not what the last run over its study was to make; empty where it is, or
     where nothing is said of it."""
-    stages = read_record(field.resolve().parents[1]).get("stages")
+    bake = field.resolve().parent
+    stages = read_record(bake.parent).get("stages") if bake.name == "bake" else None
     entry = stages.get("bake") if isinstance(stages, dict) else None
     status = entry.get("status") if isinstance(entry, dict) else None
-    if field.resolve().parent.name != "bake" or status in (None, "done"):
+    if status in (None, "done"):
         return ""
     return (
-        f"{field}: came of an earlier run than the last, which had other input or settings and did "
-        f"not come to it (run.json: {status}); {NOT_TO_BE_USED}"
+        f"{field}: came of an earlier run than the last one over this study, of which run.json "
+        f"says {status}: do not use it for what that one was asked for"
     )
 
 

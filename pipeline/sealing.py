@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -79,7 +80,9 @@ def sealed(folder: Path) -> dict[str, Any] | None:
     try:
         content: dict[str, Any] = json.loads((folder / STAGE_FILE).read_text())
         whole = all((folder / name).is_file() for name in content["files"])
-        whole = whole and {"fingerprint", "figures", "sha256"} <= set(content)
+        # What an older version wrote has no digest of its own; whose it is still counts.
+        whole = whole and isinstance(content["fingerprint"], str)
+        whole = whole and all(isinstance(content[part], dict) for part in ("figures", "files"))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     return content if whole else None
@@ -98,11 +101,11 @@ def require_unaltered(folder: Path) -> None:
     if content is None:
         return
     anew = f"to make it anew: beatfield run STUDY --out {folder.parent.parent} --from {folder.name}"
-    changed = [] if content["sha256"] == _own_digest(content) else [STAGE_FILE]
+    changed = [] if content.get("sha256") == _own_digest(content) else [STAGE_FILE]
     changed += [
         name
         for name, entry in content["files"].items()
-        if not changed and sha256_of(folder / name) != entry["sha256"]
+        if not changed and sha256_of(folder / name) != _digest_said(entry)
     ]
     if changed:
         raise InputError(
@@ -157,15 +160,26 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
+def _digest_said(entry: Any) -> object:
+    return entry.get("sha256") if isinstance(entry, dict) else None
+
+
 def digest_of_files(files: Mapping[str, str]) -> str:
-    """SHA-256 of what ``sha256sum`` prints of files, sorted by name in the order of bytes.
+    """SHA-256 of what ``sha256sum`` prints of files, sorted by name in the order of bytes; of a
+    single one its own.
 
     Parameters
     ----------
     files
         SHA-256 of each, by its path in the study.
     """
-    lines = [f"{files[name]}  {name}\n".encode() for name in sorted(files, key=str.encode)]
+    if len(files) == 1:
+        return next(iter(files.values()))
+    # Names of files need be no text.
+    lines = [
+        f"{files[name]}  ".encode() + os.fsencode(name) + b"\n"
+        for name in sorted(files, key=os.fsencode)
+    ]
     return hashlib.sha256(b"".join(lines)).hexdigest()
 
 

@@ -35,7 +35,7 @@ class _Loader(yaml.SafeLoader):
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         """A whole number; not one that a person writes to mean another than YAML 1.1 reads."""
-        text = str(node.value).lstrip("+-")
+        text = str(node.value).lstrip("+-").replace("_", "")
         if ":" in text or (text[:1] == "0" and text[1:2].isdigit()):
             raise InputError(
                 f"{self.name}: line {node.start_mark.line + 1}: {node.value} would be read as "
@@ -44,8 +44,19 @@ class _Loader(yaml.SafeLoader):
             )
         return super().construct_yaml_int(node)
 
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        """A number; not minutes and seconds."""
+        if ":" in str(node.value):
+            raise InputError(
+                f"{self.name}: line {node.start_mark.line + 1}: {node.value} would be read as "
+                f"{super().construct_yaml_float(node):g}; write it without the colon, or in quotes "
+                "where it is text"
+            )
+        return super().construct_yaml_float(node)
+
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 def read_yaml(path: Path) -> Any:

@@ -121,6 +121,8 @@ def test_a_wrong_command_ends_with_exit_code_2(
         ),
         ("bake: {margin_mm: 020}", "line 1: 020 would be read as 16; write it without"),
         ("segment: {margin_mm: 1:30}", "1:30 would be read as 90"),
+        ("segment: {margin_mm: 1:30.5}", "1:30.5 would be read as 90.5"),
+        ("bake: {margin_mm: 0_20}", "0_20 would be read as 16"),
         (f"fixtures: {{{'n' * 64}: {{}}}}", "fixtures"),
         ("bake: {samples: 3000000000}", "bake.samples: Input should be less than or equal to"),
         ("a: [", "cannot be read as YAML"),

@@ -18,6 +18,7 @@ from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
 from pipeline.field.certificate import certify
 from pipeline.field.fixture import Bounds
+from pipeline.field.manifest import write_manifest
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface
@@ -339,6 +340,18 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
         measure_field(baked, folder)
     with pytest.raises(InputError, match="has no box"):
         measure_field(baked, folder / "ball")
+
+
+@pytest.mark.parametrize("said", [None, "x", {"samples": 1}, {"samples": 200, "new": 1}])
+def test_how_a_field_was_baked_may_be_said_otherwise(folder, tmp_path, said):
+    """By another version, or by another program: it is measured by default bounds then."""
+    baked = bake_own_surfaces(folder, tmp_path / "out", own_settings())
+    content = json.loads((baked / "zarr.json").read_text())
+    content["attributes"]["beatfield"]["source"]["bake"] = said
+    (baked / "zarr.json").write_text(json.dumps(content))
+    (baked / "manifest.json").unlink()
+    write_manifest(baked)
+    assert measure_field(baked, folder)["sign_errors"] == 0
 
 
 def test_timing_and_tracker_of_ones_own(folder, tmp_path):

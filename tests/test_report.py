@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 from dataclasses import replace
@@ -30,6 +31,7 @@ from pipeline.report.moments import MARGIN_PIXELS, Moments
 from pipeline.report.page import Opening, figure_row, render
 from pipeline.report.provenance import provenance
 from pipeline.report.style import as_png, as_svg, as_webp
+from pipeline.sealing import digest_of_files
 
 PAGE_LIMIT_BYTES = 6_000_000
 
@@ -480,5 +482,16 @@ def test_the_page_tells_what_it_was_made_of_as_sha256sum_does(tmp_path: Path) ->
     ]
     assert changed.rows == [("register.min_frames", "7", "10"), ("bake.spacing_mm", "2.5", "1.5")]
     assert ("numpy", np.__version__) in software.rows
+    one = {"cine/cine.nii.gz": digests["cine/b.dcm"]}
+    assert provenance({"cine": one}, settings, tmp_path / "manifest.json").tables[0].rows[0] == (
+        "cine",
+        "1 file",
+        digests["cine/b.dcm"],
+    )
+    no_text = os.fsdecode(b"cine/b\xfc.dcm")
+    (tmp_path / "cine" / "b.dcm").rename(tmp_path / no_text)
+    by_name = {no_text: digests["cine/b.dcm"], "cine/A.dcm": digests["cine/A.dcm"]}
+    of_cine = printed("sha256sum cine/* | LC_ALL=C sort -k 2 | sha256sum").split()[0]
+    assert digest_of_files(by_name) == of_cine
     (said,) = provenance({}, Settings(), tmp_path / "manifest.json").tables[1].rows
     assert said == ("all", "default", "")

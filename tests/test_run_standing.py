@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,43 @@ def test_figures_that_were_edited_are_not_told(kitchen: Kitchen) -> None:
     with pytest.raises(InputError, match=r"a/stage\.json: is not what the stage a wrote"):
         kitchen.run()
     assert kitchen.run(first="a")["c"] == "done"
+
+
+def as_written_before(kitchen: Kitchen) -> None:
+    """Products of a version whose stage.json had neither settings nor a digest of its own."""
+    for path in (kitchen.out / "p1").glob("*/stage.json"):
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({k: content[k] for k in ("fingerprint", "figures", "files")}))
+
+
+def test_products_of_an_older_version_are_still_somebodys(kitchen: Kitchen, tmp_path: Path) -> None:
+    """Of another code, too: not replaced by another patient's, and told to be stale."""
+    kitchen.run()
+    as_written_before(kitchen)
+    kitchen.run(CHANGED, last="a", first="a")
+    assert statuses(kitchen) == {"a": "done", "b": "stale", "c": "stale"}
+    as_written_before(kitchen)
+    other = tmp_path / "elsewhere" / "p1"
+    shutil.copytree(kitchen.folder, other)
+    (other / "cine" / "image").write_text("another patient")
+    kitchen.folder = other
+    with pytest.raises(InputError, match="holds the products of another study"):
+        kitchen.run()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"files": ["text"]}, {"figures": None}, {"figures": [1]}, {"fingerprint": 3}, {"files": {}}],
+)
+def test_a_record_of_another_shape_is_none(kitchen: Kitchen, change: dict[str, Any]) -> None:
+    kitchen.run()
+    told = kitchen.out / "p1" / "b" / "stage.json"
+    told.write_text(json.dumps({**json.loads(told.read_text()), **change}))
+    if change == {"files": {}}:
+        with pytest.raises(InputError, match=r"b/stage\.json: is not what the stage b wrote"):
+            kitchen.run()
+    else:
+        assert kitchen.run() == {"a": "unchanged", "b": "done", "c": "unchanged"}
 
 
 def test_a_product_says_which_settings_made_it(kitchen: Kitchen) -> None:
@@ -240,7 +278,7 @@ def test_a_field_of_an_earlier_run_is_told(kitchen: Kitchen, tmp_path: Path) -> 
     for status, told in (("done", False), ("stale", True), ("failed", True), ("running", True)):
         (products / "run.json").write_text(json.dumps({"stages": {"bake": {"status": status}}}))
         assert bool(stale_words(field)) == told
-        assert stale_words(products / "field.zarr") == ""
+        assert stale_words(products / "field.zarr") == stale_words(Path("/field.zarr")) == ""
     for other in ("[]", '{"stages": 1}', '{"stages": {"bake": []}}', "{"):
         (products / "run.json").write_text(other)
         assert stale_words(field) == ""

@@ -16,6 +16,8 @@ from pipeline.geometry import Grid, require_rigid
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 LONGEST_NAME = 63
 """What the C header has room for, too."""
+LONGEST_FOLDER = 255
+"""Of stores that were written by something else, and that Python alone reads."""
 
 Row = tuple[float, float, float, float]
 Transform = tuple[Row, Row, Row, Row]
@@ -167,7 +169,7 @@ class FieldMetadata(Part):
     @model_validator(mode="after")
     def _names_agree(self) -> Self:
         for name, structure in self.structures.items():
-            require_name(name, "structure")
+            require_name(name, "structure", LONGEST_FOLDER)
             if structure.path != f"distance/{name}":
                 raise ValueError(f"structure {name}: path {structure.path!r} is not its own")
             if structure.spline != f"spline/{name}":
@@ -178,7 +180,7 @@ class FieldMetadata(Part):
                     f"one a phase, not {len(structure.triangles)} and {len(structure.volume_ml)}"
                 )
         for name, fixture in self.fixtures.items():
-            require_name(name, "fixture")
+            require_name(name, "fixture", LONGEST_FOLDER)
             if fixture.path != f"potential/{name}":
                 raise ValueError(f"fixture {name}: path {fixture.path!r} is not its own")
             if fixture.structure not in self.structures:
@@ -241,10 +243,10 @@ def require_phases(phases: list[float], where: str) -> None:
         )
 
 
-def require_name(name: str, what: str) -> None:
+def require_name(name: str, what: str, longest: int = LONGEST_NAME) -> None:
     """Raise InputError unless a name can be a folder everywhere."""
-    if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
+    if not NAME.fullmatch(name) or len(name) > longest:
         raise InputError(
             f"{what} name {name!r}: needs letters, digits, '_' and '-', a letter or digit first, "
-            f"{LONGEST_NAME} of them at most"
+            f"{longest} of them at most"
         )

@@ -38,7 +38,10 @@ def provenance(
         for kind, name in KINDS.items()
         if inputs.get(kind)
     ]
-    files += [(f"network {name}", "1 file", digest) for name, digest in network_digests().items()]
+    files += [
+        (f"network {name} of this version", "1 file", digest)
+        for name, digest in network_digests().items()
+    ]
     files.append(("bake/field.zarr/manifest.json", "1 file", sha256_of(manifest)))
     versions = {"beatfield": __version__, "Python": platform.python_version(), **library_versions()}
     return Section(

@@ -338,7 +338,7 @@ static void bf__string(bf__json *j, const char **start, size_t *length)
 
 /* A number, whatever the program's locale says of decimal points. Where long double has 64 bits of mantissa, as on
  * x86, 19 digits and powers of ten up to 27 are exact, and so are nearly all numbers of 17 digits in double; elsewhere
- * they are rounded to a few 1e-16 of their size. */
+ * they are rounded to a few 1e-16 of their size, from 1e-290 to 1e290. */
 static double bf__number(bf__json *j)
 {
     long double value = 0, scale = 1;
