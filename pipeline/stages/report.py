@@ -200,8 +200,8 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
     told = [f"{INTENDED_USE[0].upper()}{INTENDED_USE[1:]}."]
     if job.product("evaluate"):
         told.append(
-            "This study comes with a truth to be compared with (the last section), as synthetic "
-            "ones do, which are no patient's."
+            "This study comes with a truth to be compared with (below, Against truth), as "
+            "synthetic ones do, which are no patient's."
         )
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
