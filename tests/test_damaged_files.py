@@ -24,9 +24,9 @@ from pipeline.imaging.ecg import read_ecg
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.ultrasound import read_sweep
 from pipeline.meshes import read_mesh, write_vtp
-from pipeline.own_surfaces import _timing
 from pipeline.publish import write_whole
 from pipeline.study import open_study
+from pipeline.surface_folders import _timing
 from pipeline.yaml_files import read_yaml
 
 TETRAHEDRON = np.array([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [0, 0, 30]])

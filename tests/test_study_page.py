@@ -95,7 +95,7 @@ def test_the_pages_sweep_is_read(tmp_path: Path) -> None:
 
 
 def test_the_pages_phases_of_own_surfaces_are_read() -> None:
-    from pipeline.own_surfaces import Timing
+    from pipeline.surface_folders import Timing
 
     _, phases = shown("json")
     given = json.loads(phases)
