@@ -17,11 +17,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App, Parameter, Token
+from cyclopts import App, Parameter
 
 from pipeline import __version__
 from pipeline.caches import provide_place
-from pipeline.console import BatchConsole, Console, say, show, tell, warning_line
+from pipeline.console import BatchConsole, Console, Whole, say, show, tell, warning_line
 from pipeline.ending import guarded
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
@@ -42,17 +42,6 @@ app = App(
 STUDY = "folder of the study: cine/, and where there are any ecg/, us/, study.yaml"
 Out = Annotated[Path, Parameter(help="folder for the products; each patient gets one in it")]
 Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults without it")]
-
-
-def _whole(_type: type[int], tokens: Sequence[Token]) -> int:
-    """The parser's own way rounds 1.5 to 2."""
-    text = tokens[0].value
-    if not text.lstrip("+-").isdecimal():
-        raise ValueError(f"needs a whole number, got {text}")
-    return int(text)
-
-
-Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def _run(

@@ -1,4 +1,5 @@
-"""What the command line says on standard error while it works, and of what went wrong."""
+"""What a person types as numbers, and what the command line says on standard error while it works,
+and of what went wrong."""
 
 from __future__ import annotations
 
@@ -7,7 +8,10 @@ import os
 import re
 import sys
 import time
-from typing import TYPE_CHECKING, TextIO
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, TextIO
+
+from cyclopts import Parameter, Token
 
 from pipeline.errors import BeatfieldError
 
@@ -18,6 +22,17 @@ if TYPE_CHECKING:
 
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Characters that a terminal obeys and does not show."""
+
+
+def _whole(_type: type[int], tokens: Sequence[Token]) -> int:
+    """The parser's own way rounds 1.5 to 2."""
+    text = tokens[0].value
+    if not text.lstrip("+-").isdecimal():
+        raise ValueError(f"needs a whole number, got {text}")
+    return int(text)
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 class Console:

@@ -62,6 +62,8 @@ def test_wrong_input_ends_with_exit_code_2_and_says_what_is_wrong(
         ["run", "p"],
         ["run", "p", "--out", "o", "--untill", "bake"],
         ["batch", "p", "--out", "o", "--workers", "1.5"],
+        ["paper", "p", "--seed", "1.7"],
+        ["paper", "p", "--operators", "0x10"],
     ],
 )
 def test_a_wrong_command_ends_with_exit_code_2(

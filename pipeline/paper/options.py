@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.console import Whole
+
 DEMO_PRODUCTS = Path("demo/products-1/patient-0001")
 DEMO_STUDY = Path("demo/studies-1/patient-0001")
 
@@ -19,10 +21,10 @@ class PaperOptions:
     study: Path | None = None
     """The study whose ultrasound Figure 6 shows; the demo's for the demo's products."""
 
-    seed: int = 1
+    seed: Whole = 1
     """Of pellets and simulated operators."""
 
-    operators: int = 100
+    operators: Whole = 100
     """How many simulated operators do the task."""
 
     only: tuple[str, ...] = ()
