@@ -19,7 +19,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import LPS_FROM_RAS, read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
-from pipeline.sealing import NUMBERED
+from pipeline.sealing import PHASE_FILE
 
 
 def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> None:
@@ -106,7 +106,7 @@ def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
     InputError
         When there are none, or a file holds what is no label.
     """
-    paths = sorted(one for one in folder.glob(f"{stem}_*.nii.gz") if NUMBERED.search(one.name))
+    paths = sorted(one for one in folder.glob(f"{stem}_*.nii.gz") if PHASE_FILE.search(one.name))
     if not paths:
         raise InputError(f"{folder}: holds no {stem}_000.nii.gz ...; give the labels of each phase")
     volumes = [read_image(path) for path in paths]
@@ -130,7 +130,7 @@ def write_surfaces(folder: Path, surfaces: Mapping[str, MovingSurface]) -> None:
 
 def read_surfaces(folder: Path, phases: Float) -> dict[str, MovingSurface]:
     """What ``write_surfaces`` wrote, by structure."""
-    paths = [one for one in folder.glob("*.vtp") if NUMBERED.search(one.name)]
+    paths = [one for one in folder.glob("*.vtp") if PHASE_FILE.search(one.name)]
     names = sorted({path.stem.rsplit("_", 1)[0] for path in paths})
     return {name: _read_moving(folder, name, phases) for name in names}
 

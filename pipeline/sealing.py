@@ -44,7 +44,7 @@ LIBRARIES = (
 
 PACKAGE = Path(__file__).parent
 
-NUMBERED = re.compile(r"_\d+\.(vtp|nii\.gz)$")
+PHASE_FILE = re.compile(r"_\d+\.(vtp|nii\.gz)$")
 """How stages name a phase's file; copies that a person left beside them are called otherwise."""
 
 
@@ -112,7 +112,7 @@ def require_unaltered(folder: Path) -> None:
             f"{folder / changed[0]}: is not what the stage {folder.name} wrote: it was edited, or "
             f"damaged on the disk; {anew}"
         )
-    named = (path for path in sorted(folder.iterdir()) if NUMBERED.search(path.name))
+    named = (path for path in sorted(folder.iterdir()) if PHASE_FILE.search(path.name))
     for path in named:
         if path.name not in content["files"]:
             raise InputError(
