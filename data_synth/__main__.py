@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 QUIET_S = 2.0
@@ -36,18 +37,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+_INTERRUPTS: list[int] = []
+"""Signals that were heard."""
+
+
 def _end_cleanly() -> None:
     """Let signals that end programs interrupt the work once, so that what is half-done is cleared
     away; those that come meanwhile, as to all of a terminal's programs, are not heard."""
 
-    def interrupt(_number: int, _frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         for one in heard:
             signal.signal(one, signal.SIG_IGN)
+        _INTERRUPTS.append(number)
+        # What is raised while the compiler calls back is lost: the next step of the work raises it.
+        while frame is not None:
+            if "llvmlite" in frame.f_code.co_filename:
+                return
+            frame = frame.f_back
         raise KeyboardInterrupt
 
     # Python lets the main thread alone choose; those that are ignored, as `nohup` does, stay so.
     if threading.current_thread() is not threading.main_thread():
         return
+    _INTERRUPTS.clear()
     heard = [one for one in ENDING if signal.getsignal(one) is not signal.SIG_IGN]
     for one in heard:
         signal.signal(one, interrupt)
@@ -142,6 +154,8 @@ class ProgressLine:
 
     def __call__(self, done: int, total: int) -> None:
         """Tell how far the work has come."""
+        if _INTERRUPTS:
+            raise KeyboardInterrupt
         if time.monotonic() > self.next:
             self.shown, self.next = True, time.monotonic() + REFRESH_S
             sys.stderr.write(f"\r{self.name}: {100 * done // total:3d} %")

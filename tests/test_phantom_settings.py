@@ -181,3 +181,24 @@ def test_progress_appears_only_for_long_work(capsys):
     line(1, 2)
     line.end()
     assert capsys.readouterr().err == "\rpatient-0001:  50 %\n"
+
+
+def test_an_interrupt_in_the_compilers_callback_is_heard_at_the_next_step():
+    """Python drops what is raised there; the frame's file is how the handler knows."""
+    program = (
+        "import os, signal\n"
+        "from data_synth.__main__ import ProgressLine, _end_cleanly\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "_end_cleanly()\n"
+        "line = ProgressLine('p')\n"
+        "line(0, 10)\n"
+        "exec(compile('os.kill(os.getpid(), signal.SIGINT)', 'llvmlite/x.py', 'exec'))\n"
+        "print('went on', flush=True)\n"
+        "line(1, 10)\n"
+        "print('not heard')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "went on\n"
+    assert done.stderr.rstrip().endswith("KeyboardInterrupt")
