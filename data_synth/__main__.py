@@ -17,6 +17,7 @@ QUIET_S = 2.0
 REFRESH_S = 0.5
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INTERRUPTED_CODE = 130
+LATER_S = 0.05
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,10 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-_INTERRUPTS: list[int] = []
-"""Signals that were heard."""
-
-
 def _end_cleanly() -> None:
     """Let signals that end programs interrupt the work once, so that what is half-done is cleared
     away; those that come meanwhile, as to all of a terminal's programs, are not heard."""
@@ -48,10 +45,11 @@ def _end_cleanly() -> None:
     def interrupt(number: int, frame: FrameType | None) -> None:
         for one in heard:
             signal.signal(one, signal.SIG_IGN)
-        _INTERRUPTS.append(number)
-        # What is raised while the compiler calls back is lost: the next step of the work raises it.
+        # What is raised while the compiler calls back is lost; a moment later it is not.
         while frame is not None:
-            if "llvmlite" in frame.f_code.co_filename:
+            if frame.f_globals.get("__name__", "").startswith("llvmlite."):
+                signal.signal(signal.SIGALRM, interrupt)
+                signal.setitimer(signal.ITIMER_REAL, LATER_S)
                 return
             frame = frame.f_back
         raise KeyboardInterrupt
@@ -59,7 +57,6 @@ def _end_cleanly() -> None:
     # Python lets the main thread alone choose; those that are ignored, as `nohup` does, stay so.
     if threading.current_thread() is not threading.main_thread():
         return
-    _INTERRUPTS.clear()
     heard = [one for one in ENDING if signal.getsignal(one) is not signal.SIG_IGN]
     for one in heard:
         signal.signal(one, interrupt)
@@ -154,8 +151,6 @@ class ProgressLine:
 
     def __call__(self, done: int, total: int) -> None:
         """Tell how far the work has come."""
-        if _INTERRUPTS:
-            raise KeyboardInterrupt
         if time.monotonic() > self.next:
             self.shown, self.next = True, time.monotonic() + REFRESH_S
             sys.stderr.write(f"\r{self.name}: {100 * done // total:3d} %")

@@ -45,6 +45,23 @@ class _Loader(yaml.SafeLoader):
             lines[name] = line
         return super().construct_mapping(node, deep)
 
+    def construct_number(self, node: yaml.ScalarNode) -> float:
+        """A number; not one that a person writes to mean another than YAML 1.1 reads."""
+        digits = node.value.lstrip("+-").replace("_", "")
+        kind = node.tag.rpartition(":")[2]
+        read = self.construct_yaml_int if kind == "int" else self.construct_yaml_float
+        value: float = read(node)
+        if ":" in digits or (kind == "int" and digits[:1] == "0" and digits[1:2].isdigit()):
+            raise SynthError(
+                f"{self.name}: line {node.start_mark.line + 1}: {node.value} would be read as "
+                f"{value:g}; write it without the leading zero or colon"
+            )
+        return value
+
+
+for _kind in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.construct_number)
+
 
 class StudyEcgSettings(EcgSettings):
     """The ECG of a study: recorded inside the scanner, unless said otherwise."""

@@ -8,7 +8,6 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import warnings
@@ -22,7 +21,7 @@ from cyclopts import App, Parameter
 from pipeline import __version__
 from pipeline.caches import provide_place
 from pipeline.console import BatchConsole, Console, Whole, say, show, tell, warning_line
-from pipeline.ending import guarded
+from pipeline.ending import guarded, hear_signals
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
 from pipeline.summary import summary
@@ -403,12 +402,7 @@ def _require_no_empty(arguments: Sequence[str]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
-    # What is half-done is cleared away, as when a person interrupts.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # Who starts it with `nohup` wants it to outlive the terminal.
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
-
+    hear_signals()
     warnings.formatwarning = warning_line
 
     given = sys.argv[1:] if arguments is None else arguments

@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 from cyclopts import CycloptsError
@@ -22,6 +23,31 @@ OUT_OF_REACH = (
 )
 """What is wrong with a name, its rights or the disk behind it, and not with the program."""
 MORE_MEMORY = "use fewer --workers, raise `ulimit -v`, or take a larger machine"
+
+LATER_S = 0.05
+
+
+def hear_signals() -> None:
+    """Let signals that end programs clear away what is half-done, as a person's Ctrl-C does.
+
+    Those that are ignored stay so: who starts a program with `nohup` wants it to outlive the
+    terminal.
+    """
+    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(one) is not signal.SIG_IGN:
+            signal.signal(one, interrupt)
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt; while the compiler calls back, where Python drops what is raised, a
+    moment later."""
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").startswith("llvmlite."):
+            signal.signal(signal.SIGALRM, interrupt)
+            signal.setitimer(signal.ITIMER_REAL, LATER_S)
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def guarded(command: Callable[[], Any]) -> int:

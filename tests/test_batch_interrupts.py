@@ -161,10 +161,10 @@ def test_a_study_ends_with_its_batch_and_hears_the_batch_alone() -> None:
 def test_a_closed_terminal_interrupts_unless_it_is_to_be_outlived(ignored: bool) -> None:
     """As `nohup` asks for."""
     script = (
-        "import signal, sys; from pipeline.cli import main\n"
+        "import signal, sys; from pipeline.cli import main; from pipeline.ending import interrupt\n"
         f"signal.signal(signal.SIGHUP, signal.SIG_IGN if {ignored} else signal.SIG_DFL)\n"
         "main(['--version'])\n"
-        "heard = signal.getsignal(signal.SIGHUP) is signal.default_int_handler\n"
+        "heard = signal.getsignal(signal.SIGHUP) is interrupt\n"
         "sys.exit(10 + heard)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)

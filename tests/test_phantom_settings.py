@@ -43,6 +43,9 @@ def test_the_scanners_ecg_keeps_its_artefact_and_its_field():
         ("pathology: grief", r"pathology.*healthy.*infarct.*enlarged_atrium.*'grief'"),
         ("cine: film", r"cine.*dicom.*enhanced.*nifti"),
         ("colour: red", "colour: unknown key"),
+        ("seed: 7\nheart_rate_bpm: 0100", "line 2: 0100 would be read as 64"),
+        ("heart_rate_bpm: 1:30", "line 1: 1:30 would be read as 90"),
+        ("heart_rate_bpm: 1:30.5", "line 1: 1:30.5 would be read as 90.5"),
         ("mr:\n  slices: 8\n  slices: 9", "line 3: slices is given a second time, after line 2"),
         ("mr: {flavour: 1}", r"mr\.flavour: unknown key; check its spelling"),
         ("mr: {snrr: 20}", r"mr\.snrr: unknown key; did you mean snr\?"),
@@ -183,22 +186,28 @@ def test_progress_appears_only_for_long_work(capsys):
     assert capsys.readouterr().err == "\rpatient-0001:  50 %\n"
 
 
-def test_an_interrupt_in_the_compilers_callback_is_heard_at_the_next_step():
-    """Python drops what is raised there; the frame's file is how the handler knows."""
+@pytest.mark.parametrize(
+    "handler",
+    [
+        "from data_synth.__main__ import _end_cleanly as hear",
+        "from pipeline.ending import hear_signals as hear",
+    ],
+    ids=["phantom", "pipeline"],
+)
+def test_an_interrupt_while_the_compiler_calls_back_is_heard_when_it_has_ended(handler):
+    """What is raised within the callback would be printed and dropped."""
     program = (
-        "import os, signal\n"
-        "from data_synth.__main__ import ProgressLine, _end_cleanly\n"
+        f"import os, signal, time\n{handler}\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "_end_cleanly()\n"
-        "line = ProgressLine('p')\n"
-        "line(0, 10)\n"
-        "exec(compile('os.kill(os.getpid(), signal.SIGINT)', 'llvmlite/x.py', 'exec'))\n"
-        "print('went on', flush=True)\n"
-        "line(1, 10)\n"
+        "hear()\n"
+        "compiler = {'__name__': 'llvmlite.binding', 'os': os, 'signal': signal, 'time': time}\n"
+        "exec('os.kill(os.getpid(), signal.SIGINT); time.sleep(0.3)', compiler)\n"
+        "print('the callback ended', flush=True)\n"
+        "time.sleep(60)\n"
         "print('not heard')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=50
     )
-    assert done.stdout == "went on\n"
+    assert done.stdout == "the callback ended\n"
     assert done.stderr.rstrip().endswith("KeyboardInterrupt")
