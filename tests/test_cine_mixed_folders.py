@@ -39,12 +39,13 @@ from pydicom.uid import (
     MultiFrameGrayscaleWordSecondaryCaptureImageStorage,
     SecondaryCaptureImageStorage,
 )
+from scipy.spatial.transform import Rotation
 
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.imaging.cine import stack_frames
 from pipeline.imaging.dicom import read_dicom_study
-from pipeline.imaging.frames import Frame
+from pipeline.imaging.frames import DERIVED, ORIGINAL, Frame
 from pipeline.job import Job
 from pipeline.stages import ingest
 from pipeline.study import open_study
@@ -472,3 +473,69 @@ def test_stills_with_a_series_a_slice_may_reach_beyond_the_stack() -> None:
     # Alone the last may be a slice of the cine whose other images were lost.
     with pytest.raises(InputError, match=rf"late {SLICES} 1"):
         stack_frames(cine + late[-1:], "folder")
+
+
+def turned(frame: Frame, rotation: Rotation) -> Frame:
+    """As an oblique stack of another patient lies: its numbers are rounded otherwise."""
+    position_mm, axes = rotation.apply(frame.position_mm), rotation.apply(frame.axes)
+    return replace(frame, position_mm=position_mm, axes=axes)
+
+
+def wider(frame: Frame) -> Frame:
+    """Two columns more at both sides."""
+    position_mm = frame.position_mm - 2 * frame.spacing_mm[0] * frame.axes[0]
+    return replace(frame, position_mm=position_mm, pixels=np.pad(frame.pixels, ((0, 0), (2, 2))))
+
+
+def about(frame: Frame) -> Frame:
+    """The same image, its rows and columns counted from the other corner."""
+    rows, columns = (np.array(frame.pixels.shape) - 1) * frame.spacing_mm[::-1]
+    position_mm = frame.position_mm + columns * frame.axes[0] + rows * frame.axes[1]
+    pixels = np.rot90(frame.pixels, 2)
+    return replace(frame, position_mm=position_mm, axes=-frame.axes, pixels=pixels)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("every", [2, 3])
+@pytest.mark.parametrize(
+    ("change", "words"), [(wider, "different matrices"), (about, "turned in their plane")]
+)
+def test_slices_that_alternate_between_two_forms_are_refused(
+    seed: int, every: int, change: Callable[[Frame], Frame], words: str
+) -> None:
+    """Whichever way the last digits of the places between two slices fall."""
+    rotation = Rotation.random(random_state=seed)
+    frames = [
+        turned(slice_frame(z, z, phase, "cine"), rotation)
+        for z in range(6 * every)
+        for phase in range(PHASES)
+    ]
+    stack = [
+        change(frame) if int(frame.series_uid) % every == every - 1 else frame for frame in frames
+    ]
+    with pytest.raises(InputError, match=words):
+        stack_frames(stack, "folder")
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_cine_between_two_slices_is_left_out(seed: int) -> None:
+    """Such as one of flow through the aorta, of another matrix."""
+    rotation = Rotation.random(random_state=seed)
+    cine = [slice_frame(z, z, phase, "cine") for z, phase in ALL_FRAMES]
+    middle_mm = ORIGIN_MM + 1.5 * STEP_MM * NORMAL
+    flow = [
+        wider(slice_frame(9, 0, phase, "flow", position_mm=middle_mm)) for phase in range(PHASES)
+    ]
+    stack = stack_frames([turned(frame, rotation) for frame in cine + flow], "folder")
+    assert stack.cine.intensity.shape[:2] == (PHASES, SLICES)
+    assert [line for line in stack.left_out if "flow" in line] == list(stack.left_out)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_derived_slices_between_original_ones_make_up_one_stack(seed: int) -> None:
+    rotation = Rotation.random(random_state=seed)
+    frames = [
+        turned(slice_frame(z, z, phase, "cine", kind=(ORIGINAL, DERIVED)[z % 2]), rotation)
+        for z, phase in ALL_FRAMES
+    ]
+    assert stack_frames(frames, "folder").cine.intensity.shape[:2] == (PHASES, SLICES)

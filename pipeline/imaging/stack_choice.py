@@ -37,6 +37,12 @@ from pipeline.imaging.frames import (
 )
 from pipeline.imaging.left_out import LeftOut, inside
 
+PART_OF_STEP = 0.6
+"""A slice is there within this part of half a step: every third one of a stack is 2 / 3 off."""
+
+ROUNDING = 1e-3
+"""Part of half a step by which a slice in the very middle of two may seem farther from both."""
+
 Rank = tuple[bool, int, bool, bool, bool, int, float]
 """Whether a set is a cine stack, the images of the largest one in its direction, whether it shows
 one beat, whether it tells how long one lasts, whether original, its own number of images, pixels
@@ -72,7 +78,12 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
             left_out += _spared(others, reason)
         elif _joins(stack[0], others[0]):
             slices_mm, normal = slice_positions(stack), stack[0].normal
-            twice = [one for one in others if _covered([one], normal, slices_mm)]
+            near_mm = PART_OF_STEP * _half_step_mm(slices_mm)
+            twice = [
+                one
+                for one in others
+                if np.abs(float(one.middle_mm @ normal) - slices_mm).min() < near_mm
+            ]
             left_out += _spared(
                 twice, f"{others[0].kind} images, slices that the stack has already"
             )
@@ -248,11 +259,17 @@ def _half_step_mm(slices_mm: Float) -> float:
     return 0.5 * step_mm
 
 
-def _covered(frames: Iterable[Frame], normal: Float, slices_mm: Float) -> bool:
-    """Whether the frames show only slices that are there: nearer than half a step to one."""
+def _covered(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> bool:
+    """Whether the frames show only slices that are there.
+
+    A few between two slices show what both do. Half as many as there are, or more, may be every
+    second or third slice of one stack that was stored in parts: each must lie where one is.
+    """
     along_mm = np.array([float(frame.middle_mm @ normal) for frame in frames])
     away_mm = np.abs(along_mm[:, None] - slices_mm).min(axis=1)
-    return bool(away_mm.max() < _half_step_mm(slices_mm))
+    many = 2 * len(slice_positions(frames)) >= len(slices_mm)
+    near_mm = (PART_OF_STEP if many else 1 + ROUNDING) * _half_step_mm(slices_mm)
+    return bool(away_mm.max() < near_mm)
 
 
 def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> str | None:
