@@ -26,6 +26,23 @@ QRS: Waves = (
 T: Waves = ((0.28, 0.050, 0.25, 0.15),)
 # From a ventricle: 150 ms wide, against the usual direction, its T the other way.
 WIDE: Waves = ((0.0, 0.030, -1.40, 1.20), (0.045, 0.025, -0.60, 0.70), (0.30, 0.065, 0.60, -0.50))
+# Its T wave has two thirds of its energy.
+WIDE_TALL_T: Waves = (
+    (-0.015, 0.030, -1.30, 1.10),
+    (0.05, 0.020, -0.50, 0.35),
+    (0.28, 0.042, 1.10, -0.94),
+)
+WIDE_ON_T: Waves = (
+    (-0.015, 0.030, -1.30, 1.10),
+    (0.05, 0.020, -0.50, 0.35),
+    (0.28, 0.060, 0.70, -0.60),
+)
+# An escape beat of the ventricle, whose rise is slower than an atrial wave's.
+ESCAPE: Waves = (
+    (-0.02, 0.022, 0.75, -0.40),
+    (0.03, 0.022, 0.90, -0.80),
+    (0.35, 0.060, -0.40, 0.40),
+)
 PACED: Waves = ((-0.045, 0.0012, 1.50, -1.00), *WIDE)
 # Two summits 50 ms apart, as in bundle branch block.
 NOTCHED: Waves = (
@@ -101,13 +118,15 @@ def draw(
     return signal
 
 
-def _mixed(rng, duration_s, times_s, usual=NORMAL, early=WIDE, share=0.12, rr_s=0.85):
+def _mixed(
+    rng, duration_s, times_s, usual=NORMAL, early=WIDE, share=0.12, rr_s=0.85, ahead=(0.5, 0.65)
+):
     """Beats of one kind, some replaced by early ones with a pause behind them."""
     beats, at_s = [], 0.4
     while at_s < duration_s:
         beats.append((at_s, usual))
         if rng.random() < share:
-            ahead_s = rr_s * rng.uniform(0.5, 0.65)
+            ahead_s = rr_s * rng.uniform(*ahead)
             beats.append((at_s + ahead_s, early))
             at_s += rr_s * 2
         else:
@@ -162,10 +181,10 @@ def _fast_fibrillation(rng, duration_s, times_s):
     return beats, draw(rng, times_s, beats)
 
 
-def _complete_block(rng, duration_s, times_s):
+def _complete_block(rng, duration_s, times_s, atrial=LONE_P, own=(*QRS, *T)):
     """Atria and ventricles each keep their own time, the ventricles slowly."""
-    atrial = [(at_s, LONE_P) for at_s in steady(rng, duration_s, 0.72, 0.02)]
-    beats = [(at_s + 0.5, (*QRS, *T)) for at_s in steady(rng, duration_s, 1.6, 0.02)]
+    atrial = [(at_s, atrial) for at_s in steady(rng, duration_s, 0.72, 0.02)]
+    beats = [(at_s + 0.5, own) for at_s in steady(rng, duration_s, 1.6, 0.02)]
     return beats, draw(rng, times_s, sorted(atrial + beats), noise_mv=0.015)
 
 
@@ -233,6 +252,8 @@ CASES = {
     "ventricular premature": _mixed,
     "large ventricular premature": partial(_mixed, early=scaled(WIDE, 2.0)),
     "small ventricular premature": partial(_mixed, early=scaled(WIDE, 0.45)),
+    "ventricular premature, tall T": partial(_mixed, early=WIDE_TALL_T),
+    "ventricular on the T wave": partial(_mixed, early=WIDE_ON_T, ahead=(0.4, 0.47)),
     "atrial premature": partial(_mixed, early=(*P, *QRS, *T)),
     "paced and own": partial(_mixed, usual=PACED, early=(*P, *QRS, *T), share=0.3),
     "bigeminy": partial(_alternating, one=NORMAL, other=WIDE, early_share=0.33),
@@ -249,6 +270,9 @@ CASES = {
     "fast fibrillation": _fast_fibrillation,
     "blocked": _blocked,
     "complete block": _complete_block,
+    "complete block, wide": partial(
+        _complete_block, atrial=((-0.16, 0.020, 0.22, 0.12),), own=ESCAPE
+    ),
     "long PR, tall P": partial(_plain, waves=LONG_PR, rr_s=1.05, scatter=0.06, noise_mv=0.02),
     "gain": _gain,
     "first lead bad": _one_bad,

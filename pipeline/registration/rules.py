@@ -32,6 +32,10 @@ USUAL_WIDE = 0.36
 T_ENERGY, SHARP_ENERGY = 0.5, 0.3
 """Shares of a beat's energy under which a wave in that time is its T wave; the second, if the wave
 is as steep as so low a beat would be, which T waves are not (after Pan and Tompkins)."""
+STRANGE_T_ENERGY, STRANGE_DULL = 0.7, 0.95
+"""After a beat of another shape it is the first share, for what is less steep for its height than
+that beat by the second factor: a ventricle's T waves have up to two thirds of their beat's energy,
+and the next beat of a run is as steep as the last."""
 DULL = 0.9
 """A wave is dull whose steepness, as a share of the usual beat's, is under this share of its
 height's: atrial waves and T waves. Low beats stay steep."""
@@ -42,6 +46,8 @@ then, and theirs were no lower than by the third factor."""
 VERY_DULL = 0.4
 """Less steep for its height than the last beat by this factor are few beats of a ventricle: such a
 wave is a T wave where they came of late, however high. Theirs follow breath and posture."""
+T_FAR_HIGHER = 4.0
+"""By this factor above theirs it is a beat of a ventricle upon the T wave all the same."""
 T_NEAR, T_FOLLOW, T_EARLIER = 4, 1 / 6, 0.9
 """Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
 what is known of their energy, follow. It is so in this share of the time of T waves: coupled beats
@@ -60,6 +66,11 @@ second where a beat is overdue."""
 SHORT, BLUNT, ATRIAL_THRESHOLD = 0.45, 0.7, 0.6
 """One that does, but is under the first share of the usual beat's height, and under the second of
 the steepness that such a height should have, is an atrial wave up to the third place."""
+
+TINY, TINY_STEEP, TINY_THRESHOLD = 0.35, 1.7, 0.7
+"""Where the usual beat is wide, P waves are the steeper ones for their height. What is under the
+first share of its height is one of them up to the third place, unless it is steeper for its height
+by the second factor, as narrow QRS complexes among wide ones are."""
 
 # Of a ventricle, though its energy is low?
 WIDE_TALL, WIDE_ENERGY, WIDE_THRESHOLD = 0.5, 0.38, 0.1
@@ -114,6 +125,9 @@ def resembles(at: int, since_s: float, height: float, plan: Plan, s: State) -> b
     now = s.now[0]
     wave = s.found[now.found]
     measure_beat(at, wave, plan, s)
+    tiny = now.tall < TINY and now.steep < TINY_STEEP * now.tall
+    if tiny and _are_wide(s) and not _exceeds(height, TINY_THRESHOLD, s):
+        return False
     if wave.likeness < VERY_ALIKE:
         again = _is_wide(since_s, height, plan, s) and _came_before(s)
         return again or _exceeds(height, STRANGE_OVERDUE if now.overdue else STRANGE_THRESHOLD, s)
@@ -161,7 +175,11 @@ def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
     """Height that a wave so long after a beat needs to be none of its T wave."""
     now, until_s = s.now[0], _t_wave_until_s(s.now[0].overdue, plan, s)
     sharp = now.steep >= DULL * now.tall
-    bar = (SHARP_ENERGY if sharp else T_ENERGY) * min(now.rhythm.last_height, LARGE)
+    share = SHARP_ENERGY if sharp else T_ENERGY
+    strange = now.rhythm.last_likeness < ALIKE and since_s < T_WAVE_S
+    if strange and _is_duller_than_last(STRANGE_DULL, s):
+        share = STRANGE_T_ENERGY
+    bar = share * min(now.rhythm.last_height, LARGE)
     if since_s < until_s:
         return bar
     return bar * (1.0 - (since_s - until_s) / FADE_S) if _last_was_wide(s) else 0.0
@@ -207,7 +225,8 @@ def is_usual_t_wave(since_s: float, height: float, plan: Plan, s: State) -> bool
         rhythm.t_wave_now[k] = 1.0
     rhythm.t_height_now = max(rhythm.t_height_now, height)
     known = at < T_STEPS and rhythm.t_wave[at] > T_USUAL
-    expected = _is_duller_than_last(VERY_DULL, s) or height < T_HIGHER * rhythm.t_height
+    most = T_FAR_HIGHER if _is_duller_than_last(VERY_DULL, s) else T_HIGHER
+    expected = height < most * rhythm.t_height
     return bool(known and expected)
 
 
