@@ -47,7 +47,8 @@ VERY_DULL = 0.4
 """Less steep for its height than the last beat by this factor are few beats of a ventricle: such a
 wave is a T wave where they came of late, however high. Theirs follow breath and posture."""
 T_FAR_HIGHER = 4.0
-"""By this factor above theirs it is a beat of a ventricle upon the T wave all the same."""
+"""By this factor above theirs it is a beat of a ventricle upon the T wave all the same; and after a
+usual beat, where all else is quiet, a dull wave needs no more to be none of its T wave."""
 T_NEAR, T_FOLLOW, T_EARLIER = 4, 1 / 6, 0.9
 """Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
 what is known of their energy, follow. It is so in this share of the time of T waves: coupled beats
@@ -179,7 +180,11 @@ def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
     strange = now.rhythm.last_likeness < ALIKE and since_s < T_WAVE_S
     if strange and _is_duller_than_last(STRANGE_DULL, s):
         share = STRANGE_T_ENERGY
-    bar = share * min(now.rhythm.last_height, LARGE)
+    last = min(now.rhythm.last_height, LARGE)
+    bar = share * last
+    usual = now.rhythm.last_likeness >= ALIKE and now.rhythm.beats > FIRST_BEATS
+    if usual and now.between < MOST_RESTLESS and _is_duller_than_last(T_DULL, s):
+        bar = min(bar, max(SHARP_ENERGY * last, T_FAR_HIGHER * now.rhythm.t_height))
     if since_s < until_s:
         return bar
     return bar * (1.0 - (since_s - until_s) / FADE_S) if _last_was_wide(s) else 0.0
