@@ -139,7 +139,10 @@ class Optics:
 
     @property
     def pulse_mm(self) -> float:
-        """Standard deviation of the pulse's envelope along the beam: two periods at half height."""
+        """Standard deviation of the echo's envelope in range: four periods at half height.
+
+        A period is half a wavelength of range, for sound goes there and back.
+        """
         return 0.9 * self.wavelength_mm
 
     @property
@@ -167,7 +170,11 @@ class Optics:
         return np.asarray(1 / np.hypot(1 / sent, 1 / received))
 
     def slice_mm(self, ranges_mm: Float) -> Float:
-        """Width of the beam there and back, across the picture's plane: a fixed lens both ways."""
+        """Width of the beam there and back, across the picture's plane: a fixed lens both ways.
+
+        The standard deviation of its amplitude; what tissue is heard varies by it too, which makes
+        walls rather more blurred than the power of such a beam alone would.
+        """
         far = np.abs(1 / ranges_mm - 1 / self.slice_focus_mm)
         cone = self.slice_aperture_mm * far / np.sqrt(12)
         one_way = np.hypot(_SINC * self.wavelength_mm / self.slice_aperture_mm, cone)

@@ -221,17 +221,19 @@ def jet_loss(
     jets: tuple[Jet, ...],
     points: Float,
     phase: float,
-    rr_s: float,
+    cycle_s: float,
     moment: float,
 ) -> npt.NDArray[np.float32]:
     """Factor (n,) by which swirling blood has lost signal at heart-frame points (n, 3).
+
+    ``phase`` is of the nominal cycle, which would last ``cycle_s`` at the pace of this moment.
 
     Speeds inside a voxel at a jet's edge spread normally by a share of the jet's own; their
     phases, ``moment`` radians per m/s, then average to ``exp(-(moment * spread)^2 / 2)``.
     """
     log_loss = np.zeros(len(points))
     for jet in jets:
-        flow = jet.flow_mm3[int((phase % 1.0) * STEPS) % STEPS] / rr_s
+        flow = jet.flow_mm3[int((phase % 1.0) * STEPS) % STEPS] / cycle_s
         speed_m_s = flow / (np.pi * jet.radius_mm**2) / 1000
         if speed_m_s * moment < 0.1:
             continue

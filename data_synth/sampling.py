@@ -170,7 +170,7 @@ class Slice:
         signal = self.signal * gains[:, None]
         values = signal[tissue, self.bin[self.near]]
         if self.settings.flow_dephasing > 0 and self.view.jets:
-            values *= np.where(BLOOD[tissue], self._jet_loss(nominal), np.float32(1))
+            values *= np.where(BLOOD[tissue], self._jet_loss(phase, nominal), np.float32(1))
         image = self.rest + gains[Tissue.BLOOD_VESSEL] * self.rest_vessels
         image[self.near] = values.mean(axis=0)
         labels = np.zeros(len(self.points), np.uint8)
@@ -180,10 +180,13 @@ class Slice:
     def _nominal(self, phase: float) -> float:
         return float(self.heart.nominal_phase(phase % 1.0, self.view.rr_s))
 
-    def _jet_loss(self, nominal: float) -> npt.NDArray[np.float32]:
-        settings, view = self.settings, self.view
-        moment = settings.flow_dephasing
-        return jet_loss(self.heart, view.jets, self.in_heart, nominal, view.rr_s, moment)
+    def _jet_loss(self, phase: float, nominal: float) -> npt.NDArray[np.float32]:
+        view, step = self.view, 1e-3
+        passed = (self._nominal(phase + step) - self._nominal(phase - step)) % 1.0
+        # As long as the nominal cycle would last at the pace of this moment.
+        cycle_s = view.rr_s * 2 * step / passed
+        moment = self.settings.flow_dephasing
+        return jet_loss(self.heart, view.jets, self.in_heart, nominal, cycle_s, moment)
 
     def _tissues(self, phase: float) -> tuple[Label, Label]:
         """Tissue of all samples at the near pixels, (sample, pixel); and of their middles.

@@ -234,7 +234,7 @@ def sweep_poses(
     """``(n, 4, 4)`` true ``mr_from_transducer``: a slow turn of the fan, and the hand's sway."""
     passed = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-9)
     swings = sway(rng, times_s, 6)
-    # Ease in and out: the hand starts and ends at rest.
+    # Ease in and out: the hand starts and ends at half its mean speed.
     eased = passed - np.sin(2 * np.pi * passed) / (4 * np.pi)
     axis = np.eye(3)[1 if probe.turn_about == "beam" else 0]
     turns = np.deg2rad(probe.turn_deg) * (eased - 0.5)

@@ -219,3 +219,28 @@ def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, surfaces
     found = estimated(recording, surfaces, stamped(recording))
     assert (found.offset_s is not None) == known
     assert found.sd_s == (pytest.approx(np.hypot(sd_s, 0.005)) if known else np.inf)
+
+
+@pytest.mark.parametrize("true_s", [0.0, 0.02, 0.06, 0.2])
+@pytest.mark.parametrize("rr_s", [0.8, 0.81, 0.9])
+def test_an_offset_that_fits_as_well_half_a_beat_away_is_seen(rr_s, true_s):
+    """Wherever the two lie: the scan is as long as a beat, and goes round."""
+
+    class Score:
+        def __init__(self, away):
+            self.turn = 2 * np.pi * away / rr_s
+
+        def score(self, _):
+            return 1 + 0.5 * np.cos(2 * self.turn) + 0.002 * np.cos(self.turn)
+
+    class Twofold(_Profile):
+        __slots__ = ()
+
+        def at(self, offset_s):
+            return Score(offset_s - true_s)
+
+    timing = Timing([np.zeros(1)], np.arange(10) * rr_s, rr_s)
+    best_s, rival = Twofold(None, None, timing)._scan(np.eye(4))
+    # The scan goes by steps of 20 ms.
+    assert abs(best_s - true_s) <= 0.011
+    assert rival > 0.9

@@ -17,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import bake_field
 from pipeline.paper import robustness
-from pipeline.paper.constrained_motion import _shown
+from pipeline.paper.constrained_motion import _shown, phases_between
 from pipeline.paper.dissection import clock, rows_of
 from pipeline.paper.laws import slopes
 from pipeline.paper.reader_time import percentiles_us
@@ -166,3 +166,15 @@ def test_percentiles_rise():
     found = percentiles_us(lambda n: sum(range(n % 50)), 500)
     assert (np.diff(found) >= 0).all()
     assert found[0] > 0
+
+
+@pytest.mark.parametrize("rr_s", [0.6, 0.8, 1.1])
+def test_the_heart_of_figure_6_beats_as_the_frames_tell(rr_s: float) -> None:
+    """Not at the rate of the images that the field was made of, by which only lost beats count."""
+    times_s = np.sort(np.random.default_rng(3).uniform(2, 9, 25))
+    # Nobody looked for two beats.
+    times_s[12:] += 2 * rr_s
+    at_s = np.linspace(times_s[0], times_s[-1], 400)
+    found = phases_between(times_s, times_s / rr_s % 1, at_s, 0.9 * rr_s)
+    away = (found - at_s / rr_s + 0.5) % 1 - 0.5
+    np.testing.assert_allclose(away, 0, atol=1e-9)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ellipsoid_heart import (
@@ -93,6 +95,21 @@ def test_frame_of_something_else_changes_nothing_but_the_certainty(prepared, lat
         assert np.array_equal(drift.state.mr_from_tracker, state.mr_from_tracker)
         before, after = (np.diag(one.covariance_mm2) for one in (state, drift.state))
         assert (after > before).all()
+
+
+def test_frames_never_tell_what_all_of_them_share(prepared, later):
+    """Surfaces that lie beside the heart are the same surfaces for every frame."""
+    follower, state, lattices, _ = prepared
+    floor = SETTINGS.model_error_mm**2
+    held = replace(follower, creep_mm=0.0)
+    for sweep, image, pose, phase, _ in 3 * later[:10]:
+        state = held.follow(state, lattices[sweep], image, pose, phase).state
+    left = np.linalg.eigvalsh(state.covariance_mm2)
+    # The floor is that error where all directions are held alike, and more where they are less.
+    assert np.trace(state.covariance_mm2) > 6 * floor
+    assert left.min() > 0
+    # What frames do tell, thirty of them have told.
+    assert np.trace(state.covariance_mm2 - held.shared_mm2) < 0.5 * np.trace(held.shared_mm2)
 
 
 def test_phase_must_lie_in_the_beat(prepared, later):

@@ -189,6 +189,25 @@ def test_a_calibration_of_the_study_stands_in_for_the_files(tmp_path):
         read_sweeps(files(path, probe_from_image=calibration(9.0).tolist()))
 
 
+@pytest.mark.parametrize("third", [np.zeros(3), calibration()[:3, 0]], ids=["none", "in plane"])
+def test_a_calibration_without_a_third_axis_can_be_turned_back(tmp_path, third):
+    """Pixels are (i, j, 0): nobody asks where it leads, but whoever cuts surfaces by a picture."""
+    flat = calibration()
+    flat[:3, 2] = third
+    (sweep,) = read_sweeps(
+        files(write(tmp_path / "s.mha", good_fields()), probe_from_image=flat.tolist())
+    )
+    (whole,) = read_sweeps(
+        files(write(tmp_path / "t.mha", good_fields()), probe_from_image=calibration().tolist())
+    )
+    np.testing.assert_allclose(sweep.tracker_from_image[..., :2], whole.tracker_from_image[..., :2])
+    across, down, normal = np.moveaxis(sweep.tracker_from_image[:, :3, :3], 2, 0)
+    np.testing.assert_allclose(np.einsum("nk,nk->n", across, normal), 0, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("nk,nk->n", down, normal), 0, atol=1e-9)
+    areas = np.linalg.norm(np.cross(across, down), axis=1)
+    np.testing.assert_allclose(np.linalg.det(sweep.tracker_from_image[:, :3, :3]), areas**1.5)
+
+
 def test_a_pose_of_zeros_is_none(tmp_path):
     blank = np.diag([0.0, 0, 0, 1])
     fields = good_fields() | {"Seq_Frame0004_ProbeToTrackerTransform": text(blank)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,12 @@ class Tracing:
 
 
 def trace_along(
-    field: ForceField, fixture: str, line_mm: Float, lasts_s: float, phase: float, force: bool
+    field: ForceField,
+    fixture: str,
+    line_mm: Float,
+    lasts_s: float,
+    phase_at: Callable[[float], float],
+    force: bool,
 ) -> Tracing:
     """Follow a line at even speed with the population's middle hand, holding the fixture's device.
 
@@ -40,12 +46,11 @@ def trace_along(
         ``(n, 3)`` points where the hand means to be, evenly in time.
     lasts_s
         Time for the whole line.
-    phase
-        Of the heart at the start.
+    phase_at
+        The heart's phase so many seconds after the start.
     force
         Whether the fixture's force is rendered.
     """
-    assert field.rr_s is not None
     handle = handle_of(field.fixtures[fixture].device.name)
     mass = (handle.mass_kg + POPULATION["hand_kg"].centre) / 1000
     stiff = POPULATION["stiffness_n_per_mm"].centre
@@ -60,9 +65,10 @@ def trace_along(
     inertia = 2 * mass / TICK_S
     resist = inertia + handle.damping_ns_per_mm + damp + 0.5 * stiff * TICK_S
     for n in range(count):
-        now = phase + n * TICK_S / field.rr_s
         x, y, z = place.tolist()
-        held = np.array(field.force_at(x, y, z, now, fixture)) if force else np.zeros(3)
+        held = np.zeros(3)
+        if force:
+            held = np.array(field.force_at(x, y, z, phase_at(n * TICK_S), fixture))
         tips[n], forces[n] = place, held
         rate = (meant[n + 1] - meant[n]) / TICK_S
         pulled = held + stiff * (0.5 * (meant[n] + meant[n + 1]) - place) + damp * rate

@@ -21,6 +21,8 @@ TRACKER, REFERENCE = "Tracker", "Reference"
 
 # Pixels of a medical scanner, in mm: outside this the matrix is in other units, or no calibration.
 _PIXEL_MM = (0.01, 4.0)
+# A third column leaves the picture's plane by this share of a pixel or more, or it has none.
+_LEAVES = 1e-3
 # A marker that rests seems to move at the probe by some 0.4 mm (0.25 mm, and 0.1 degrees a hand's
 # breadth or two away), root mean square.
 _REST_MM = 0.8
@@ -94,11 +96,23 @@ def image_calibration(fields: Fields, given: Float | None, where: str) -> Float:
     """
     if given is not None:
         require_calibration(given, "us.probe_from_image of study.yaml")
-        return given
+        return _invertible(given)
     name = _name("Image", "Probe")
     probe_from_image = _matrix(fields, name, where)
     require_calibration(probe_from_image, f"{where}: {name}")
-    return probe_from_image
+    return _invertible(probe_from_image)
+
+
+def _invertible(probe_from_image: Float) -> Float:
+    """The same for pixels (i, j, 0); where the third column leaves their plane nowhere, such as one
+    of zeros, across it by a pixel's size."""
+    across, down, third = probe_from_image[:3, :3].T
+    normal = np.cross(across, down)
+    if abs(normal @ third) > _LEAVES * np.linalg.norm(normal) * np.linalg.norm(across):
+        return probe_from_image
+    whole = probe_from_image.copy()
+    whole[:3, 2] = normal / np.sqrt(np.linalg.norm(normal))
+    return whole
 
 
 def reference_pose(fields: Fields) -> Float | None:

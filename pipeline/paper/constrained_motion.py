@@ -88,10 +88,20 @@ def constrained_motion(subject: Subject) -> Section:
     )
 
 
+def phases_between(times_s: Float, phases: Float, at_s: Float, rr_s: float | None) -> Float:
+    """Phases of moments between frames, whose own are in [0, 1): from frame to frame the heart goes
+    on evenly, by so many whole beats more as come nearest to beats of ``rr_s``."""
+    turned = np.diff(phases) % 1
+    if rr_s is not None:
+        turned += np.maximum(np.round(np.diff(times_s) / rr_s - turned), 0)
+    turns = phases[0] + np.concatenate([[0.0], np.cumsum(turned)])
+    return np.asarray(np.interp(at_s, times_s, turns) % 1)
+
+
 def _off_mm(field: ForceField, structure: str, scene: Scene, which: int) -> float:
     """Root mean square distance of the tip from the beating surface."""
-    turn = (scene.ticks_s - scene.times_s[0]) / float(field.rr_s or 1.0)
-    distance = field.distance_mm(scene.tips_mm[which], scene.phases[0] + turn, structure)
+    phases = phases_between(scene.times_s, scene.phases, scene.ticks_s, field.rr_s)
+    distance = field.distance_mm(scene.tips_mm[which], phases, structure)
     return float(np.sqrt(np.mean(distance**2)))
 
 
@@ -111,9 +121,13 @@ def _scene(subject: Subject, field: ForceField, structure: str) -> Scene:
     image_from_mr: Float = np.linalg.inv(mr_from_image).astype(np.float64)
     times_s, phases = np.array([r.time_s for r in rows]), np.array([r.phase for r in rows])
     line_mm = _line(field, structure, image_from_mr, sweep.images.shape[1:], float(phases[0]))
+
+    def phase_at(passed_s: float) -> float:
+        return float(phases_between(times_s, phases, times_s[:1] + passed_s, field.rr_s)[0])
+
+    lasts_s = float(times_s[-1] - times_s[0])
     traced = [
-        trace_along(field, GUIDE, line_mm, float(times_s[-1] - times_s[0]), float(phases[0]), force)
-        for force in (False, True)
+        trace_along(field, GUIDE, line_mm, lasts_s, phase_at, force) for force in (False, True)
     ]
     surfaces = read_surfaces(subject.products / "surface", field.phases)
     return Scene(

@@ -237,8 +237,10 @@ class _Profile:
         offsets_s = _SCAN_S * np.arange(-most, most + 1)
         scores = np.array([self.at(float(one)).score(pose) for one in offsets_s])
         top = int(scores.argmax())
-        inner = np.r_[False, (scores[1:-1] >= scores[:-2]) & (scores[1:-1] >= scores[2:]), False]
-        far = inner & (np.abs(offsets_s - offsets_s[top]) > _ELSEWHERE_S)
+        # A beat on all is as it was: the ends, half a beat to either side, are neighbours.
+        peak = (scores >= np.roll(scores, 1)) & (scores >= np.roll(scores, -1))
+        apart_s = np.abs(offsets_s - offsets_s[top])
+        far = peak & (np.minimum(apart_s, _SCAN_S * len(scores) - apart_s) > _ELSEWHERE_S)
         return float(offsets_s[top]), float((scores[far] / scores[top]).max(initial=0.0))
 
     def summit(self, pose: Float, offset_s: float) -> tuple[float, float] | None:

@@ -104,6 +104,10 @@ class Follower:
     """How much information, per square millimetre, a unit of a frame's curvature is worth: below 1
     where samples and neighbouring frames repeat one another."""
 
+    shared_mm2: Float
+    """``(6, 6)`` covariance of what all frames share, such as the error of the surfaces, in square
+    millimetres of `Pivot.move`: however many follow, they cannot tell it."""
+
     creep_mm: float = 0.1
     """Standard deviation by which the pose may change from frame to frame, along each axis and
     about each axis at the pivot's lever."""
@@ -136,17 +140,23 @@ class Follower:
         """
         if not 0 <= phase < 1:
             raise InputError(f"a frame's phase must lie in [0, 1), got {phase!r}")
-        waited = state.covariance_mm2 + self.creep_mm**2 * np.eye(6)
+        # What frames can tell, the rest considered but not estimated (S. F. Schmidt, "Application
+        # of state-space methods to navigation problems", Adv Control Syst 3 (1966) 293-340).
+        waited = state.covariance_mm2 - self.shared_mm2 + self.creep_mm**2 * np.eye(6)
         samples = eye.sample(image, tracker_from_image, phase)
         if samples.frames == 0:
-            return self._drift(replace(state, covariance_mm2=waited), used=False)
+            return self._left(state, waited)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
         if not explained > _ODD_SHARE * state.usual:
-            return self._drift(replace(state, covariance_mm2=waited), used=False)
+            return self._left(state, waited)
         usual = state.usual + _FOLLOWED * (explained - state.usual)
         step, covariance = self._update(samples, state.mr_from_tracker, waited)
         pose = self.pivot.move(state.mr_from_tracker, step)
-        return self._drift(LiveState(pose, covariance, usual), used=True)
+        return self._drift(LiveState(pose, covariance + self.shared_mm2, usual), used=True)
+
+    def _left(self, state: LiveState, waited: Float) -> Drift:
+        """After a frame that told nothing."""
+        return self._drift(replace(state, covariance_mm2=waited + self.shared_mm2), used=False)
 
     def _update(self, samples: Samples, pose: Float, prior_mm2: Float) -> tuple[Float, Float]:
         """Step and covariance after one frame's loss, expanded about the present pose."""
@@ -203,7 +213,12 @@ def prepare_follower(
     curvature = curvature_at(losses)
     sweep = level.samples.sweep([len(one.images) for one in sweeps])
     spread = sandwich(curvature, sweep)
-    follower = Follower(search.fine, search.pivot, pose, information_of(spread, curvature.bending))
+    scale = np.repeat([1.0, search.pivot.lever_mm], 3)
+    covariance_mm2 = registered.covariance * np.outer(scale, scale)
+    shared_mm2 = rising(covariance_mm2 - spread)
+    follower = Follower(
+        search.fine, search.pivot, pose, information_of(spread, curvature.bending), shared_mm2
+    )
     lengths_mm = settings.sample_spacing_mm, settings.smoothing_mm, settings.trend_mm
     eyes = [
         Eye(
@@ -213,9 +228,7 @@ def prepare_follower(
         for seen, sweep in zip(compared, sweeps, strict=True)
     ]
     usual = float(np.median(1 - registered.residual[registered.valid]))
-    scale = np.repeat([1.0, search.pivot.lever_mm], 3)
-    covariance_mm2 = registered.covariance * np.outer(scale, scale)
-    return follower, LiveState(pose, covariance_mm2, usual), eyes
+    return follower, LiveState(pose, spread + shared_mm2, usual), eyes
 
 
 def information_of(covariance_mm2: Float, bending: Float) -> float:
