@@ -35,6 +35,10 @@ EDGE_PX = 0.8
 REFINE = 2
 """In-plane refinement of the outlines: distances are exact to a quarter of a pixel."""
 
+TIE_MM = np.float32(1e-3)
+"""Where an outline halves a point's cell, its depths in two classes are both nil: the margin, times
+this, tells which is deeper. Else all such points would be the lower class's, and that too large."""
+
 
 def isotropic_labels(
     probability: Float32,
@@ -208,8 +212,8 @@ def _signed_depth_mm(fine: Float32, grid_mm: float) -> Float32:
     # Distances run to the nearest point of the other side; the outline lies half a step before.
     signed = np.where(inside > 0, within - 0.5, 0.5 - beyond).astype(np.float32)
     size = (fine.shape[1] // REFINE, fine.shape[0] // REFINE)
-    coarse = cv2.resize(signed, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(coarse * np.float32(grid_mm / REFINE))
+    coarse, margin = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (signed, fine))
+    return np.asarray(coarse * np.float32(grid_mm / REFINE) + TIE_MM * margin)
 
 
 def interpolate_planes(depth_mm: Float32, plane_mm: Float, height_mm: Float) -> Label:
