@@ -18,6 +18,7 @@ REFRESH_S = 0.5
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INTERRUPTED_CODE = 130
 LATER_S = 0.05
+"""An interrupt that would be lost is tried again so much later."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,6 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _end_cleanly()
         _write_patients(options)
+        if signal.setitimer(signal.ITIMER_REAL, 0)[0]:
+            raise KeyboardInterrupt
     except SynthError as error:
         sys.stderr.write(f"error: {error}\n")
         return SynthError.exit_code
@@ -52,6 +55,7 @@ def _end_cleanly() -> None:
                 signal.setitimer(signal.ITIMER_REAL, LATER_S)
                 return
             frame = frame.f_back
+        signal.setitimer(signal.ITIMER_REAL, 0)
         raise KeyboardInterrupt
 
     # Python lets the main thread alone choose; those that are ignored, as `nohup` does, stay so.

@@ -54,7 +54,7 @@ class _Loader(yaml.SafeLoader):
         if ":" in digits or (kind == "int" and digits[:1] == "0" and digits[1:2].isdigit()):
             raise SynthError(
                 f"{self.name}: line {node.start_mark.line + 1}: {node.value} would be read as "
-                f"{value:g}; write it without the leading zero or colon"
+                f"{value}; write it without the leading zero or colon, or, of text, in quotes"
             )
         return value
 

@@ -25,6 +25,7 @@ OUT_OF_REACH = (
 MORE_MEMORY = "use fewer --workers, raise `ulimit -v`, or take a larger machine"
 
 LATER_S = 0.05
+"""An interrupt that would be lost is tried again so much later."""
 
 
 def hear_signals() -> None:
@@ -47,6 +48,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
             signal.setitimer(signal.ITIMER_REAL, LATER_S)
             return
         frame = frame.f_back
+    # Once: what is half-done is being cleared away then.
+    signal.setitimer(signal.ITIMER_REAL, 0)
     raise KeyboardInterrupt
 
 
@@ -56,6 +59,8 @@ def guarded(command: Callable[[], Any]) -> int:
         code = command()
         if sys.stdout is not None:
             sys.stdout.flush()
+        if signal.setitimer(signal.ITIMER_REAL, 0)[0]:
+            raise KeyboardInterrupt
     except BrokenPipeError:
         # Who reads has read enough (`beatfield verify ... | head`); nobody is left to tell. What
         # was to be done may not be: the exit code is that of programs which this signal ends.

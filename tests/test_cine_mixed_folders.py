@@ -495,26 +495,57 @@ def about(frame: Frame) -> Frame:
     return replace(frame, position_mm=position_mm, axes=-frame.axes, pixels=pixels)
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("every", [2, 3])
-@pytest.mark.parametrize(
-    ("change", "words"), [(wider, "different matrices"), (about, "turned in their plane")]
-)
-def test_slices_that_alternate_between_two_forms_are_refused(
-    seed: int, every: int, change: Callable[[Frame], Frame], words: str
-) -> None:
-    """Whichever way the last digits of the places between two slices fall."""
-    rotation = Rotation.random(random_state=seed)
-    frames = [
-        turned(slice_frame(z, z, phase, "cine"), rotation)
-        for z in range(6 * every)
+def alternating(rotation: Rotation, *changes: Callable[[Frame], Frame]) -> list[Frame]:
+    """A stack that begins and ends with its first form, and has others between."""
+    return [
+        turned(changes[z % len(changes)](slice_frame(z, z, phase, "cine")), rotation)
+        for z in range(5 * len(changes) + 1)
         for phase in range(PHASES)
     ]
-    stack = [
-        change(frame) if int(frame.series_uid) % every == every - 1 else frame for frame in frames
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("changes", [(wider,), (about,), (wider, about)])
+def test_slices_that_alternate_between_forms_are_refused(
+    seed: int, changes: tuple[Callable[[Frame], Frame], ...]
+) -> None:
+    """Whichever way the last digits of the places between two slices fall."""
+    frames = alternating(Rotation.random(random_state=seed), lambda frame: frame, *changes)
+    with pytest.raises(InputError, match=r"different matrices|turned in their plane"):
+        stack_frames(frames, "folder")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.4, 0.45])
+def test_a_cine_planned_anew_is_left_out(share: float) -> None:
+    """Of another matrix, its slices elsewhere between those of the stack."""
+    cine = [slice_frame(z, z, phase, "cine") for z, phase in ALL_FRAMES]
+    again = [
+        wider(
+            slice_frame(
+                9, z, phase, "again", position_mm=ORIGIN_MM + (z + share) * STEP_MM * NORMAL
+            )
+        )
+        for z in range(SLICES - 1)
+        for phase in range(PHASES)
     ]
-    with pytest.raises(InputError, match=words):
-        stack_frames(stack, "folder")
+    stack = stack_frames(cine + again, "folder")
+    assert stack.cine.intensity.shape[:2] == (PHASES, SLICES)
+    assert len(stack.left_out) == 1
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 3, 0.4, 0.5])
+def test_late_enhancement_between_the_slices_is_no_cine(share: float) -> None:
+    """Two series of the cine's own matrix, one moment each."""
+    cine = [slice_frame(z, z, phase, "cine") for z, phase in ALL_FRAMES]
+    late = [
+        slice_frame(
+            20 + k, z, k, f"late {k}", position_mm=ORIGIN_MM + (z + share) * STEP_MM * NORMAL,
+            pixels=np.full((ROWS, COLUMNS), k),
+        )
+        for k in range(2)
+        for z in range(SLICES - 1)
+    ]  # fmt: skip
+    assert_is_the_stack(stack_frames(cine + late, "folder"))
 
 
 @pytest.mark.parametrize("seed", range(8))

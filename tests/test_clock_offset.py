@@ -226,21 +226,40 @@ def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, surfaces
 def test_an_offset_that_fits_as_well_half_a_beat_away_is_seen(rr_s, true_s):
     """Wherever the two lie: the scan is as long as a beat, and goes round."""
 
+    best_s, rival = scanned(
+        rr_s, lambda turn: 1 + 0.5 * np.cos(2 * turn) + 0.002 * np.cos(turn), true_s
+    )
+    # The scan goes by steps of 20 ms at the most.
+    assert abs(best_s - true_s) <= 0.011
+    assert rival > 0.9
+
+
+@pytest.mark.parametrize("rr_s", [0.8, 0.81, 0.82, 0.9, 1.0, 1.01])
+@pytest.mark.parametrize("true_s", [0.0, 0.02, 0.06, 0.2])
+def test_where_the_scan_goes_round_is_no_summit(rr_s, true_s):
+    """A flat profile with one summit, lopsided, so that it is on a slope there."""
+    best_s, rival = scanned(
+        rr_s, lambda turn: 1 + 0.02 * np.cos(turn) + 0.004 * np.sin(2 * turn), true_s
+    )
+    assert abs(best_s - true_s) < 0.1
+    assert rival == 0
+
+
+def scanned(rr_s, profile, true_s):
+    """Where a scan finds the summit of a profile over turns of a beat, and its rival."""
+
     class Score:
-        def __init__(self, away):
-            self.turn = 2 * np.pi * away / rr_s
+        def __init__(self, turn):
+            self.turn = turn
 
         def score(self, _):
-            return 1 + 0.5 * np.cos(2 * self.turn) + 0.002 * np.cos(self.turn)
+            return profile(self.turn)
 
-    class Twofold(_Profile):
+    class Drawn(_Profile):
         __slots__ = ()
 
         def at(self, offset_s):
-            return Score(offset_s - true_s)
+            return Score(2 * np.pi * (offset_s - true_s) / rr_s)
 
     timing = Timing([np.zeros(1)], np.arange(10) * rr_s, rr_s)
-    best_s, rival = Twofold(None, None, timing)._scan(np.eye(4))
-    # The scan goes by steps of 20 ms.
-    assert abs(best_s - true_s) <= 0.011
-    assert rival > 0.9
+    return Drawn(None, None, timing)._scan(np.eye(4))

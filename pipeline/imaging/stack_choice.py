@@ -14,7 +14,7 @@ from operator import itemgetter
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Mask
 from pipeline.imaging.frames import (
     DERIVED,
     LEAVE_OUT,
@@ -37,8 +37,9 @@ from pipeline.imaging.frames import (
 )
 from pipeline.imaging.left_out import LeftOut, inside
 
-PART_OF_STEP = 0.6
-"""A slice is there within this part of half a step: every third one of a stack is 2 / 3 off."""
+BETWEEN, NEAR = (1.0, 2 / 3), 0.05
+"""How far, in half steps, every second or third slice of a stack lies from the others, and by how
+much places may be off."""
 
 ROUNDING = 1e-3
 """Part of half a step by which a slice in the very middle of two may seem farther from both."""
@@ -78,11 +79,11 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
             left_out += _spared(others, reason)
         elif _joins(stack[0], others[0]):
             slices_mm, normal = slice_positions(stack), stack[0].normal
-            near_mm = PART_OF_STEP * _half_step_mm(slices_mm)
+            apart = _are_between(others, normal, slices_mm)
             twice = [
                 one
-                for one in others
-                if np.abs(float(one.middle_mm @ normal) - slices_mm).min() < near_mm
+                for one, between in zip(others, apart, strict=True)
+                if not between and _covered([one], normal, slices_mm)
             ]
             left_out += _spared(
                 twice, f"{others[0].kind} images, slices that the stack has already"
@@ -260,16 +261,24 @@ def _half_step_mm(slices_mm: Float) -> float:
 
 
 def _covered(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> bool:
-    """Whether the frames show only slices that are there.
+    """Whether the frames show only slices that are there: within half a step of one."""
+    return bool(_half_steps(frames, normal, slices_mm).max() < 1 + ROUNDING)
 
-    A few between two slices show what both do. Half as many as there are, or more, may be every
-    second or third slice of one stack that was stored in parts: each must lie where one is.
-    """
+
+def _are_between(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Mask:
+    """Which frames may be every second or third slice of one stack that was stored in parts: those
+    just between two slices, if the set has half as many as there are, or more."""
+    many = 2 * len(slice_positions(frames)) >= len(slices_mm)
+    away = _half_steps(frames, normal, slices_mm)
+    near = np.abs(away[:, None] - BETWEEN).min(axis=1) < NEAR
+    return np.asarray(near & many)
+
+
+def _half_steps(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Float:
+    """How far each frame lies from the nearest slice, in half steps."""
     along_mm = np.array([float(frame.middle_mm @ normal) for frame in frames])
     away_mm = np.abs(along_mm[:, None] - slices_mm).min(axis=1)
-    many = 2 * len(slice_positions(frames)) >= len(slices_mm)
-    near_mm = (PART_OF_STEP if many else 1 + ROUNDING) * _half_step_mm(slices_mm)
-    return bool(away_mm.max() < near_mm)
+    return np.asarray(away_mm / _half_step_mm(slices_mm))
 
 
 def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> str | None:
@@ -284,6 +293,8 @@ def _why_left_out(first: Frame, slices_mm: Float, others: Sequence[Frame]) -> st
     if not are_in_one_beat(others):
         return "many beats in real time, no cine"
     if not _covered(others, first.normal, slices_mm):
+        return None
+    if _are_between(others, first.normal, slices_mm).any():
         return None
     rows, columns = other.pixels.shape
     sort = "" if other.kind == first.kind else f"{other.kind} images, "

@@ -10,6 +10,7 @@ along that profile and from its bending (the sandwich of ``uncertainty``, in one
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -233,14 +234,15 @@ class _Profile:
     def _scan(self, pose: Float) -> tuple[float, float]:
         """The best offset within half a beat to either side, at one pose; and the share of its
         score that an offset elsewhere reaches."""
-        most = int(median_rr_s(self.timing.r_times_s) / 2 / _SCAN_S)
-        offsets_s = _SCAN_S * np.arange(-most, most + 1)
+        beat_s = median_rr_s(self.timing.r_times_s)
+        count = math.ceil(beat_s / _SCAN_S)
+        offsets_s = beat_s / count * (np.arange(count) - count // 2)
         scores = np.array([self.at(float(one)).score(pose) for one in offsets_s])
         top = int(scores.argmax())
         # A beat on all is as it was: the ends, half a beat to either side, are neighbours.
         peak = (scores >= np.roll(scores, 1)) & (scores >= np.roll(scores, -1))
         apart_s = np.abs(offsets_s - offsets_s[top])
-        far = peak & (np.minimum(apart_s, _SCAN_S * len(scores) - apart_s) > _ELSEWHERE_S)
+        far = peak & (np.minimum(apart_s, beat_s - apart_s) > _ELSEWHERE_S)
         return float(offsets_s[top]), float((scores[far] / scores[top]).max(initial=0.0))
 
     def summit(self, pose: Float, offset_s: float) -> tuple[float, float] | None:

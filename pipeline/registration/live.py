@@ -4,7 +4,9 @@ The pose is a state of six numbers that may creep; each frame measures it a litt
 filter adds up what the frames say: the state's information is that of the registration, less what
 the time since may have undone, plus the frame's own (as in A. H. Jazwinski, "Stochastic Processes
 and Filtering Theory", Academic Press 1970, chapter 7, with the frame's loss expanded to second
-order about the present pose in the place of a linear measurement).
+order about the present pose in the place of a linear measurement). What all frames share no frame
+can tell: it is considered, not estimated, and stays in the covariance (S. F. Schmidt, "Application
+of state-space methods to navigation problems", Adv Control Syst 3 (1966) 293-340).
 """
 
 from __future__ import annotations
@@ -49,7 +51,8 @@ class LiveState:
     """4x4, the present estimate."""
 
     covariance_mm2: Float
-    """``(6, 6)`` of its error, in square millimetres of `Pivot.move`."""
+    """``(6, 6)`` of its error, in square millimetres of `Pivot.move`; `Follower.shared_mm2` is part
+    of it."""
 
     usual: float
     """Running mean of the share of grey values that the model explains."""
@@ -140,8 +143,6 @@ class Follower:
         """
         if not 0 <= phase < 1:
             raise InputError(f"a frame's phase must lie in [0, 1), got {phase!r}")
-        # What frames can tell, the rest considered but not estimated (S. F. Schmidt, "Application
-        # of state-space methods to navigation problems", Adv Control Syst 3 (1966) 293-340).
         waited = state.covariance_mm2 - self.shared_mm2 + self.creep_mm**2 * np.eye(6)
         samples = eye.sample(image, tracker_from_image, phase)
         if samples.frames == 0:

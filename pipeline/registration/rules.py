@@ -49,6 +49,8 @@ wave is a T wave where they came of late, however high. Theirs follow breath and
 T_FAR_HIGHER = 4.0
 """By this factor above theirs it is a beat of a ventricle upon the T wave all the same; and after a
 usual beat, where all else is quiet, a dull wave needs no more to be none of its T wave."""
+T_KNOWN = 0.02
+"""Energy from which T waves have been seen; where none was, they may yet grow."""
 T_NEAR, T_FOLLOW, T_EARLIER = 4, 1 / 6, 0.9
 """Then is to so many steps: the energy of a T wave has one summit or two. How fast that share, and
 what is known of their energy, follow. It is so in this share of the time of T waves: coupled beats
@@ -126,7 +128,7 @@ def resembles(at: int, since_s: float, height: float, plan: Plan, s: State) -> b
     now = s.now[0]
     wave = s.found[now.found]
     measure_beat(at, wave, plan, s)
-    tiny = now.tall < TINY and now.steep < TINY_STEEP * now.tall
+    tiny = now.tall < TINY and now.steep < TINY_STEEP * now.tall and wave.likeness < OWN
     if tiny and _are_wide(s) and not _exceeds(height, TINY_THRESHOLD, s):
         return False
     if wave.likeness < VERY_ALIKE:
@@ -182,7 +184,8 @@ def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
         share = STRANGE_T_ENERGY
     last = min(now.rhythm.last_height, LARGE)
     bar = share * last
-    usual = now.rhythm.last_likeness >= ALIKE and now.rhythm.beats > FIRST_BEATS
+    known = now.rhythm.t_height > T_KNOWN and now.rhythm.beats > FIRST_BEATS
+    usual = known and now.rhythm.last_likeness >= ALIKE
     if usual and now.between < MOST_RESTLESS and _is_duller_than_last(T_DULL, s):
         bar = min(bar, max(SHARP_ENERGY * last, T_FAR_HIGHER * now.rhythm.t_height))
     if since_s < until_s:
