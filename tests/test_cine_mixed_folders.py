@@ -533,6 +533,36 @@ def test_a_cine_planned_anew_is_left_out(share: float) -> None:
     assert len(stack.left_out) == 1
 
 
+@pytest.mark.parametrize("step", [0.55, 0.7, 0.85])
+def test_a_cine_of_another_step_is_left_out(step: float) -> None:
+    """Some of its slices lie in the middle of two of the stack, and some a third of the way."""
+    cine = [slice_frame(z, z, phase, "cine") for z in range(10) for phase in range(PHASES)]
+    places_mm = np.arange(0.1, 9, step) * STEP_MM
+    again = [
+        wider(slice_frame(9, 0, phase, "again", position_mm=ORIGIN_MM + at_mm * NORMAL))
+        for at_mm in places_mm[:9]
+        for phase in range(PHASES)
+    ]
+    stack = stack_frames(cine + again, "folder")
+    assert stack.cine.intensity.shape[:2] == (PHASES, 10)
+    assert len(stack.left_out) == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_derived_slices_those_that_are_lacking_are_taken(seed: int) -> None:
+    """Every second original one was not sent; the derived ones are all there."""
+    rotation = Rotation.random(random_state=seed)
+    count = 2 * SLICES + 1
+    frames = [
+        turned(slice_frame(k, z, phase, "cine", kind=kind), rotation)
+        for k, (kind, step) in enumerate(((ORIGINAL, 2), (DERIVED, 1)))
+        for z in range(0, count, step)
+        for phase in range(PHASES)
+    ]
+    stack = stack_frames(frames, "folder")
+    assert stack.cine.intensity.shape[:2] == (PHASES, count)
+
+
 @pytest.mark.parametrize("share", [0.0, 1 / 3, 0.4, 0.5])
 def test_late_enhancement_between_the_slices_is_no_cine(share: float) -> None:
     """Two series of the cine's own matrix, one moment each."""

@@ -267,11 +267,12 @@ def _covered(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> bool:
 
 def _are_between(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Mask:
     """Which frames may be every second or third slice of one stack that was stored in parts: those
-    just between two slices, if the set has half as many as there are, or more."""
+    just between two slices, if the set has half as many as there are, or more, and all its other
+    frames lie on slices. A stack of another step lies anywhere."""
     many = 2 * len(slice_positions(frames)) >= len(slices_mm)
     away = _half_steps(frames, normal, slices_mm)
     near = np.abs(away[:, None] - BETWEEN).min(axis=1) < NEAR
-    return np.asarray(near & many)
+    return np.asarray(near & many & (near | (away < NEAR)).all())
 
 
 def _half_steps(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Float:
