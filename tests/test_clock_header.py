@@ -61,6 +61,8 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             rows.append((2, r_s, False))
         if mood == 8:
             rows.append((0, r_s + rng.uniform(2.5, 3.5), False))
+        if mood == 14:
+            rows += [(0, r_s + k * rng.choice([0.005, 0.1, 0.18]), False) for k in range(1, 5)]
         if mood == 10:
             rows.append((0, now_s + rng.choice([0.015, 0.025, 0.4, 1.0]), False))
         r_s += step_s
@@ -139,12 +141,12 @@ int main(void)
 
 
 def test_beats_as_near_to_each_other_as_their_spread_are_pythons(program):
-    rows = np.array([[0, 0.0, 0], [0, 0.05, 0], [1, 0.06, 1]])
-    given = np.array([1.0, 4.0, 0.14]).tobytes() + rows.tobytes()
+    rows = np.array([[0, 0.0, 0], [0, 0.18, 0], [1, 0.19, 1]])
+    given = np.array([3.0, 4.0, 0.14]).tobytes() + rows.tobytes()
     done = subprocess.run([program], input=given, capture_output=True, check=True)
     found = np.frombuffer(done.stdout).reshape(-1, 6)
     assert np.isfinite(found).all()
-    np.testing.assert_allclose(found, by_python(rows, 1.0, 0.14), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, by_python(rows, 3.0, 0.14), rtol=0, atol=1e-9)
 
 
 def test_a_clock_of_nonsense_is_never_valid_and_renders_nothing(tmp_path):

@@ -54,6 +54,9 @@ LATENCY_S = 0.14
 """An R peak is known about 0.132 s after it, 99 in 100 within this."""
 SHORTEST_RR_S, LONGEST_RR_S = 0.2, 3.0
 """Of a heart."""
+NEAREST_S = 0.18
+"""Ventricles are not excited again so soon: a peak nearer to the last one is a bounce of a line, or
+a pulse of a pacemaker or of diathermy, and tells no rate."""
 R_SD_S = 0.002
 CLOSE = 0.02
 """Largest distance in phase from where the beats say for a phase to be valid."""
@@ -174,6 +177,7 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     if c[BEATS] < 2.0 or c[GAP] > 0.0:
         c[GAP] = 0.0
         return NORMAL_BEAT
+    strange = strange or rr_s < NEAREST_S
     off_s = rr_s - c[RR]
     known = c[COUNT] >= 3.0
     # Before a prediction can be trusted, intervals are held against one another.

@@ -136,6 +136,7 @@ extern "C" {
 #define BFC_LATENCY_S 0.14
 #define BFC_SHORTEST_RR_S 0.2
 #define BFC_LONGEST_RR_S 3.0
+#define BFC_NEAREST_S 0.18 /* a nearer peak is no beat: a bounce, a pulse of a pacemaker or of diathermy */
 #define BFC_R_SD_S 0.002
 #define BFC_REGULAR 0.10
 #define BFC_MOST 0.17
@@ -400,6 +401,8 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
         c->known.gap = 0;
         return BF_NORMAL_BEAT;
     }
+    if (rr_s < BFC_NEAREST_S)
+        strange = 1;
     off_s = rr_s - c->known.rr_s;
     known = c->known.count >= 3;
     if (known)
