@@ -95,6 +95,19 @@ def test_a_tank_that_is_empty_from_the_start_drives_nothing(encoder_mm, capacity
     assert tank.level_mj > -0.1
 
 
+def test_a_step_back_and_a_rest_do_not_arm_an_empty_tank():
+    """The hand is pushed on until nothing is left, gives way by one count of its encoder, rests for
+    a quarter of a second and is pushed on again."""
+    tank, count_mm = EnergyTank(5.0, 20.0), 0.02
+    places = count_mm * np.round(np.arange(20_000) * 0.03 / count_mm)
+    back = np.full(230, places[-1] - count_mm)
+    places = np.concatenate([places, back, np.full(50, places[-1])])
+    forces = np.array([tank.passed((x, 0.0, 0.0), (1.9, 0.0, 0.0))[0] for x in places])
+    assert forces[0] == 1.9
+    # A twentieth.
+    assert np.abs(np.diff(forces)).max() < 0.096
+
+
 @given(st.floats(0.2, 4), st.floats(0.5, 12), st.floats(0, 10))
 def test_no_swing_gives_more_than_the_tank_held(swing_mm, rate_hz, level_mj):
     given_mj = simulate(wall(swing_mm, rate_hz), EnergyTank(level_mj, 20.0), 1.5)
@@ -133,6 +146,8 @@ def test_a_low_tank_lessens_what_drives_by_its_level_and_what_brakes_not_at_all(
     # Where the tool rests, what it did last stands.
     np.testing.assert_allclose(along(tank, 0.0, 5), 0.5, atol=1e-6)
     np.testing.assert_allclose(along(tank, -1e-9, 5), 0.5 + 0.005 * np.arange(1, 6), atol=1e-6)
+    # Nor does more come back where it rests: what is left could not pay for a step forward.
+    np.testing.assert_allclose(along(tank, 0.0, 50), 0.525, atol=1e-6)
     np.testing.assert_allclose(along(tank, -1e-9, 200)[-1], 1.0)
     np.testing.assert_array_equal(along(EnergyTank(2.1, 20.0), 1e-9, 30), 1.0)
 

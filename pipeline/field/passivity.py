@@ -109,13 +109,16 @@ class EnergyTank:
         """Share of the force to render in this tick; ``ahead_mj`` is its work over the last way.
 
         What a tool at rest did last stands, or a coarse encoder would tell one thing and the other
-        by turns.
+        by turns. Nor does force come back at rest while the tank is low: it could not pay for the
+        next step forward.
         """
         if ahead_mj < 0 or ahead_mj > 0:
             self._driving = ahead_mj > 0
         low_mj, goal = max(LOW * self._capacity_mj, LOW_TICKS * ahead_mj), 0.0
-        if self._driving and self.level_mj < low_mj:
+        if self.level_mj < low_mj and self._driving:
             goal = 1.0 - self.level_mj / low_mj if self.level_mj > 0 else 1.0
+        elif self.level_mj < low_mj and not ahead_mj < 0:
+            goal = self._withheld
         self._withheld += min(max(goal - self._withheld, -GIVE_BACK), WITHHOLD)
         return 1.0 - self._withheld
 

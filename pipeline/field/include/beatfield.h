@@ -2118,14 +2118,16 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
 #define BF__GIVE_BACK 0.005
 
 /* Lessen a force by degrees while it drives and the tank is low; ahead is its work over the last way. What
- * a tool at rest did last stands, or a coarse encoder would tell one thing and the other by turns. */
+ * a tool at rest did last stands, or a coarse encoder would tell one thing and the other by turns. Nor
+ * does force come back at rest while the tank is low: it could not pay for the next step forward. */
 static void bf__lessen(bf_tank *tank, double force_n[3], double *ahead)
 {
     double low = BF__LOW * tank->capacity_mj, goal = 0, change;
     int axis;
     if (*ahead > 0 || *ahead < 0) tank->driving = *ahead > 0;
     if (low < BF__LOW_TICKS * *ahead) low = BF__LOW_TICKS * *ahead;
-    if (tank->driving && tank->level_mj < low) goal = tank->level_mj > 0 ? 1 - tank->level_mj / low : 1;
+    if (tank->level_mj < low && tank->driving) goal = tank->level_mj > 0 ? 1 - tank->level_mj / low : 1;
+    else if (tank->level_mj < low && !(*ahead < 0)) goal = tank->withheld;
     change = goal - tank->withheld;
     if (change > BF__WITHHOLD) change = BF__WITHHOLD;
     if (change < -BF__GIVE_BACK) change = -BF__GIVE_BACK;
