@@ -147,7 +147,41 @@ def test_beats_that_a_monitor_tells_late_need_a_clock_that_waits(late_s, waits_s
             ticks_told.append(clock.at(now_s).valid)
         else:
             clock.at(now_s)
-    assert all(ticks_told) is valid
+    assert set(ticks_told) == {valid}
+
+
+@pytest.mark.parametrize("behind_s", [0.18, 0.25, 0.3, 0.38, 0.5])
+def test_beats_whose_clock_falls_behind_while_the_phase_is_valid_end_that_for_good(behind_s):
+    """As where the loop's clock is set forward: each beat is regular, and told too late."""
+    clock, valid = PhaseClock(0.8), []
+    for k in range(10_000):
+        now_s = k * TICK_S
+        if (k - 33) % 200 == 0:
+            clock.beat(now_s - 0.132)
+        tick = clock.at(now_s + (behind_s if now_s > 20 else 0.0))
+        valid.append(tick.valid)
+    # Until the first beat is overdue nothing shows it.
+    assert valid[4999]
+    assert not any(valid[round(21.6 / TICK_S) :])
+
+
+def test_a_question_long_before_the_loop_is_no_usual_turn_of_it():
+    """Asked to warm up, at 0, and then at times of an epoch, 30 times a second, with one stall."""
+    start_s, clock = 1.7e9, PhaseClock(0.8)
+    clock.at(0.0)
+    told = 0
+    for k in range(180):
+        now_s = start_s + k / 30
+        while start_s + 0.8 * told + 0.132 <= now_s:
+            clock.beat(start_s + 0.8 * told)
+            told += 1
+        before = clock.at(now_s)
+    assert before.fade == 1
+    after = clock.at(now_s + 0.5)
+    moved = (after.phase - before.phase + 0.5) % 1 - 0.5
+    # Three usual turns, at one and a half times the speed.
+    assert abs(moved) <= 1.5 * 3 / 30 / 0.8 + 1e-6
+    assert not after.valid
 
 
 @pytest.mark.parametrize("told", [False, True])

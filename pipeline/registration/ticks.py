@@ -74,6 +74,8 @@ TICK_S = 0.001
 HELD_UP = 3.0
 """So many usual turns of the loop, or ``SLACK_S``, are all that the phase makes up for in one
 answer: a loop that was held up for longer, or whose time was set, would render a jump."""
+MOST_TURN_S = 0.1
+"""The first turn counts for no longer: a question asked to warm up may lie long before the loop."""
 FOLLOWED = 0.1
 """Share of the difference by which a turn changes what is a usual one."""
 MOST_TIME_S = 1e11
@@ -188,11 +190,25 @@ def beat(c: Float, r_s: float, strange: bool) -> int:
     c[RINGS + place] = rr_s
     c[RINGS + KEPT + place] = -1.0 if strange else (1.0 if regular else 0.0)
     c[COUNT] += 1.0
+    learning = c[NEEDED] > 1.0
     settled = judge(c, regular, off_s)
+    if not learning:
+        _doubt_if_late(c, r_s)
     if c[STATE] == FIBRILLATING:
         return IRREGULAR_BEAT
     # The third beat of a new rate is one of its rhythm.
     return ECTOPIC_BEAT if early and not settled else NORMAL_BEAT
+
+
+@inner
+def _doubt_if_late(c: Float, r_s: float) -> None:
+    """A beat that is told so late was overdue, however regular: by a clock that is behind the
+    loop's every beat is, and the phase is off by as much. The first beats come late for another
+    reason: a detector tells them when it knows what a beat looks like."""
+    if c[STARTED] > 0.0 and c[NOW] - r_s > c[LATENCY] + MOST_SHARE * c[RR]:
+        c[GOOD], c[VALID] = 0.0, 0.0
+        if c[STATE] == REGULAR:
+            c[STATE] = LOST
 
 
 @asked
@@ -257,7 +273,7 @@ def advance(c: Float, now_s: float, usable: bool, withheld: bool) -> int:
 def _followed(c: Float, passed_s: float) -> float:
     """How much of the time since the last question the phase may make up for."""
     if c[TURN] == 0.0:
-        c[TURN] = passed_s
+        c[TURN] = min(passed_s, MOST_TURN_S)
     followed_s = min(passed_s, max(SLACK_S, HELD_UP * c[TURN]))
     c[TURN] += FOLLOWED * (followed_s - c[TURN])
     return float(followed_s)

@@ -150,6 +150,7 @@ extern "C" {
 #define BFC_SLACK_S 0.02
 #define BFC_TICK_S 0.001
 #define BFC_HELD_UP 3.0
+#define BFC_MOST_TURN_S 0.1 /* a question asked to warm up may lie long before the loop */
 #define BFC_FOLLOWED 0.1
 #define BFC_MOST_TIME_S 1e11
 
@@ -387,7 +388,7 @@ void bf_take_back(bf_clock *c)
 bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
 {
     double rr_s, off_s;
-    int known, regular, early, place, settled;
+    int known, regular, early, place, settled, learning;
     c->before = c->known;
     if (!bfc_is_time(r_s) || (c->known.beats > 0.0 && !(r_s > c->known.last_r_s)))
         return BF_NO_BEAT;
@@ -415,7 +416,16 @@ bf_beat_kind bf_beat(bf_clock *c, double r_s, int strange)
     c->known.interval_s[place] = rr_s;
     c->known.regular[place] = strange ? -1 : regular;
     c->known.count += 1;
+    learning = c->known.needed > 1;
     settled = bfc_judge(c, regular, off_s);
+    /* Told so late it was overdue, however regular: by a clock that is behind the loop's every beat is.
+       The first beats come late because a detector must know what a beat looks like. */
+    if (!learning && c->started && c->now_s - r_s > c->latency_s + BFC_MOST * c->known.rr_s) {
+        c->known.good = 0;
+        c->valid = 0;
+        if (c->known.rhythm == BF_REGULAR)
+            c->known.rhythm = BF_LOST;
+    }
     if (c->known.rhythm == BF_FIBRILLATING)
         return BF_IRREGULAR_BEAT;
     /* The third beat of a new rate is one of its rhythm. */
@@ -487,7 +497,7 @@ static double bfc_followed(bf_clock *c, double passed_s)
 {
     double followed_s;
     if (c->turn_s == 0.0)
-        c->turn_s = passed_s;
+        c->turn_s = bfc_min(passed_s, BFC_MOST_TURN_S);
     followed_s = bfc_min(passed_s, bfc_max(BFC_SLACK_S, BFC_HELD_UP * c->turn_s));
     c->turn_s += BFC_FOLLOWED * (followed_s - c->turn_s);
     return followed_s;
