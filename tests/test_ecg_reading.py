@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import warnings
 
 import numpy as np
@@ -333,7 +334,27 @@ def test_csv_samples_that_were_stamped_in_blocks_are_told(tmp_path):
 def test_csv_row_that_stands_twice_is_told(tmp_path):
     times_s = np.delete(np.arange(1001), 500) / RATE_HZ
     times_s[500] = times_s[499]
-    with pytest.raises(InputError, match=r"line 502\); take out the copy"):
+    with pytest.raises(InputError, match=r"line 502\); take one of the two rows out"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
+
+
+@pytest.mark.parametrize("back_s", [0.1, 0.3, 86400.0])
+def test_csv_clock_that_was_set_back_is_mended_by_adding_what_is_told(tmp_path, back_s):
+    """By NTP, or at midnight; sorted rows would make another heart of it."""
+    times_s = 86398.0 + np.arange(1000) / RATE_HZ
+    set_back = np.where(np.arange(1000) < 500, times_s, times_s - back_s)
+    with pytest.raises(InputError, match=rf"line 502\); .* add {back_s:g} s") as told:
+        read_ecg(write_csv(tmp_path / "ecg.csv", times_s=set_back))
+    added_s = float(re.search(r"add (\S+) s", str(told.value))[1])
+    set_back[500:] += added_s
+    mended = read_ecg(write_csv(tmp_path / "mended.csv", times_s=set_back))
+    assert mended.sampling_rate_hz == pytest.approx(RATE_HZ, rel=1e-6)
+
+
+def test_csv_gap_of_an_hour_is_no_other_unit(tmp_path):
+    times_s = np.arange(1000) / RATE_HZ
+    times_s[500:] += 3600
+    with pytest.raises(InputError, match="not evenly spaced"):
         read_ecg(write_csv(tmp_path / "ecg.csv", times_s=times_s))
 
 

@@ -120,12 +120,11 @@ def _even_step_s(times_s: Float, path: Path) -> float:
     if not (steps_s > 0).all():
         worst = int(np.argmin(steps_s > 0))
         _refuse_jitter(off_s, even_s, steps_s, path)
-        mend = "take out the copy" if steps_s.min() == 0 else "sort the rows by time"
         raise InputError(
             f"{path}: time_s does not rise from {times_s[worst]} to {times_s[worst + 1]} s "
-            f"(line {worst + 3}); {mend}"
+            f"(line {worst + 3}); {_mend_of_falling(steps_s)}"
         )
-    _require_seconds(even_s, path)
+    _require_seconds(float(np.median(steps_s)), path)
     # Rounded times stay within half a step of the grid and no step doubles; a lost sample does it.
     if np.ptp(off_s) > even_s or steps_s.max() > 1.75 * even_s:
         _refuse_jitter(off_s, even_s, steps_s, path)
@@ -136,6 +135,19 @@ def _even_step_s(times_s: Float, path: Path) -> float:
             "leads are nan, or cut the recording there"
         )
     return even_s
+
+
+def _mend_of_falling(steps_s: Float) -> str:
+    """What to do about times that do not rise."""
+    if steps_s.min() == 0:
+        return "take one of the two rows out if it is a copy, else write the time of each"
+    if (steps_s < 0).sum() > 1:
+        return "sort the rows by time"
+    short_s = float(np.median(steps_s) - steps_s.min())
+    return (
+        f"if the clock was set back there, or passed midnight, add {short_s:.6g} s to the times "
+        "from that line on; else sort the rows by time"
+    )
 
 
 def _refuse_jitter(off_s: Float, even_s: float, steps_s: Float, path: Path) -> None:

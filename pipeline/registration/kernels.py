@@ -7,9 +7,13 @@ import math
 import numpy as np
 from numba import njit
 
-SUMS = 6
-"""Per frame: grey with blood and with wall, blood with itself, blood with wall, wall with itself,
-and the sum of blood and wall."""
+PARTS = 3
+"""What the model is made of: blood, its walls, and, where the images end inside a chamber, blood
+carried on; a model without that has two."""
+
+SUMS = 10
+"""Per frame: grey with each of the parts; blood with each, wall with wall and with what is carried
+on, that with itself; and the sum of blood and wall."""
 
 
 @njit(cache=True, nogil=True)
@@ -28,7 +32,7 @@ def add_up(  # type: ignore[no-untyped-def]
     with_trend,
 ):
     """Per frame: products of the shares with grey, trend and each other, and their own sum."""
-    phases, depth, height, width, _ = share.shape
+    phases, depth, height, width, parts = share.shape
     m = index_from_tracker
     for f in range(len(first) - 1):
         before, after, late = lower[f], (lower[f] + 1) % phases, weight[f]
@@ -44,9 +48,17 @@ def add_up(  # type: ignore[no-untyped-def]
                 blood_late, wall_late = _interpolate(share, after, k, j, i, w, v, u)
                 blood += late * (blood_late - blood)
                 wall += late * (wall_late - wall)
+                row = trend[trend_row[f] + s - first[f]]
                 if blood > 0 or wall > 0:
-                    row = trend[trend_row[f] + s - first[f]]
                     _accumulate(sums[f], with_trend[f], blood, wall, grey[s], row)
+                if parts > 2:
+                    near = np.float32(u), np.float32(v), np.float32(w)
+                    late32 = np.float32(late)
+                    carried = _carried(share, before, after, late32, k, j, i, near)[0]
+                    if carried > 0:
+                        _accumulate_carried(
+                            sums[f], with_trend[f], blood, wall, carried, grey[s], row
+                        )
 
 
 @njit(cache=True, nogil=True)
@@ -67,16 +79,27 @@ def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def _accumulate(sums, with_trend, blood, wall, grey, trend):  # type: ignore[no-untyped-def]
-    """Add one sample to a frame's sums."""
+    """Add one sample's blood and wall to a frame's sums."""
     sums[0] += blood * grey
     sums[1] += wall * grey
-    sums[2] += blood * blood
-    sums[3] += blood * wall
-    sums[4] += wall * wall
-    sums[5] += blood + wall
+    sums[3] += blood * blood
+    sums[4] += blood * wall
+    sums[6] += wall * wall
+    sums[9] += blood + wall
     for c in range(len(trend)):
         with_trend[0, c] += blood * trend[c]
         with_trend[1, c] += wall * trend[c]
+
+
+@njit(cache=True, nogil=True)
+def _accumulate_carried(sums, with_trend, blood, wall, carried, grey, trend):  # type: ignore[no-untyped-def]
+    """Add what is carried on at one sample to a frame's sums."""
+    sums[2] += carried * grey
+    sums[5] += blood * carried
+    sums[7] += wall * carried
+    sums[8] += carried * carried
+    for c in range(len(trend)):
+        with_trend[2, c] += carried * trend[c]
 
 
 @njit(cache=True, nogil=True)
@@ -99,9 +122,9 @@ def bend(  # type: ignore[no-untyped-def]
     squares,
     with_trend,
 ):
-    """Per frame: products of the fitted picture's six changes with a step of the pose with grey,
-    blood and wall (``pushes``), with each other, and with the trend."""
-    phases, depth, height, width, _ = share.shape
+    """Per frame: products of the fitted picture's six changes with a step of the pose with grey
+    and the model's parts (``pushes``), with each other, and with the trend."""
+    phases, depth, height, width, parts = share.shape
     m = index_from_tracker
     change = np.zeros(6)
     for f in range(len(first) - 1):
@@ -118,7 +141,15 @@ def bend(  # type: ignore[no-untyped-def]
                 blood, wall, slope_x, slope_y, slope_z = _slope(
                     share, before, after, late, k, j, i, near, coefficients[f]
                 )
-                if blood > 0 or wall > 0:
+                carried = np.float32(0)
+                if parts > 2:
+                    carried, rise_x, rise_y, rise_z = _carried(
+                        share, before, after, late, k, j, i, near
+                    )
+                    slope_x += coefficients[f, 2] * rise_x
+                    slope_y += coefficients[f, 2] * rise_y
+                    slope_z += coefficients[f, 2] * rise_z
+                if blood > 0 or wall > 0 or carried > 0:
                     change[0] = slope_x / spacing_mm[0]
                     change[1] = slope_y / spacing_mm[1]
                     change[2] = slope_z / spacing_mm[2]
@@ -133,6 +164,8 @@ def bend(  # type: ignore[no-untyped-def]
                         pushes[f, 0, a] += change[a] * grey[s]
                         pushes[f, 1, a] += change[a] * blood
                         pushes[f, 2, a] += change[a] * wall
+                        if parts > 2:
+                            pushes[f, 3, a] += change[a] * carried
                         for b in range(6):
                             squares[f, a, b] += change[a] * change[b]
                         for c in range(len(row)):
@@ -164,3 +197,24 @@ def _slope(share, before, after, late, k, j, i, near, coefficients):  # type: ig
             slope_y += sj * wk * here
             slope_z += sk * wj * here
     return blood, wall, slope_x, slope_y, slope_z
+
+
+@njit(cache=True, nogil=True)
+def _carried(share, before, after, late, k, j, i, near):  # type: ignore[no-untyped-def]
+    """What is carried on between two phases, trilinear, and its slope, a node, along x, y and z."""
+    x, y, z = near
+    one, nothing = np.float32(1), np.float32(0)
+    carried, slope_x, slope_y, slope_z = nothing, nothing, nothing, nothing
+    for dk in range(2):
+        wk, sk = (z, one) if dk else (one - z, -one)
+        for dj in range(2):
+            wj, sj = (y, one) if dj else (one - y, -one)
+            row, next_row = share[before, k + dk, j + dj], share[after, k + dk, j + dj]
+            left = (one - late) * row[i, 2] + late * next_row[i, 2]
+            rise = (one - late) * row[i + 1, 2] + late * next_row[i + 1, 2] - left
+            here = left + x * rise
+            carried += wj * wk * here
+            slope_x += wj * wk * rise
+            slope_y += sj * wk * here
+            slope_z += sk * wj * here
+    return carried, slope_x, slope_y, slope_z

@@ -183,7 +183,7 @@ def prepare_search(
     if settings.reading == "grey":
         tissue = as_seen(draw_tissue(surfaces, settings.grid_mm, cine))
     else:
-        tissue = draw_tissue(in_short_steps(surfaces), settings.grid_mm)
+        tissue = draw_tissue(in_short_steps(surfaces), settings.grid_mm, cine, muscle=False)
     pivot = pivot_of(cavities_of(surfaces))
     coarse = blurred(tissue, _COARSE_BLUR_MM)
     fine = blurred(tissue, settings.smoothing_mm)

@@ -18,14 +18,16 @@ from typing import Any, Self
 import numpy as np
 
 from pipeline.field.threads import shared
-from pipeline.geometry import Float, Integer
+from pipeline.geometry import Float, Integer, Mask
 from pipeline.registration.frames import Samples
-from pipeline.registration.kernels import SUMS, add_up, bend
+from pipeline.registration.kernels import PARTS, SUMS, add_up, bend
 from pipeline.registration.tissue_map import TissueMap
 
 # Grey values of variance 1 explained by less than this say nothing: it keeps the fit solvable
 # where a frame misses the heart.
 _RIDGE = 1e-3
+# Where products of two parts stand among the sums.
+_PRODUCTS = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
 # Fewer samples are added up before another thread would have started.
 _THREADS, _SAMPLES_A_THREAD = 2, 16_384
 
@@ -104,7 +106,7 @@ def expansion(
     frames = samples.frames
     coefficients, spacing_mm = fit.coefficients.astype(np.float32), np.array(tissue.grid.spacing_mm)
     centre = (np.asarray(centre_mm) - tissue.grid.origin_mm) / spacing_mm
-    pushes, squares = np.zeros((frames, 3, 6)), np.zeros((frames, 6, 6))
+    pushes, squares = np.zeros((frames, 1 + PARTS, 6)), np.zeros((frames, 6, 6))
     with_trend = np.zeros((frames, 6, samples.trend.shape[1]))
 
     def add(some: slice) -> None:
@@ -147,22 +149,26 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Every frame's grey values fitted by blood and walls."""
+    """Every frame's grey values fitted by the model's parts."""
 
     explained: Float
     """``(frames,)``."""
 
     coefficients: Float
-    """``(frames, 2)`` of blood and wall."""
+    """``(frames, parts)``."""
 
     normal: Float
-    """``(frames, 2, 2)`` of the equations that gave them."""
+    """``(frames, parts, parts)`` of the equations that gave them; of what is not fitted, 1 on the
+    diagonal alone."""
+
+    fitted: Mask
+    """``(frames, parts)``: which are fitted."""
 
     sums: Float
-    """``(frames, 6)``: see `SUMS`."""
+    """``(frames, SUMS)``."""
 
     with_trend: Float
-    """``(frames, 2, columns)`` of blood and wall."""
+    """``(frames, parts, columns)``."""
 
 
 def _looked_at(samples: Samples, tissue: TissueMap, place: _Place, some: slice) -> tuple[Any, ...]:
@@ -189,7 +195,7 @@ def _in_parts(add: Callable[[slice], None], samples: Samples) -> None:
 
 def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
     sums = np.zeros((samples.frames, SUMS))
-    with_trend = np.zeros((samples.frames, 2, samples.trend.shape[1]))
+    with_trend = np.zeros((samples.frames, PARTS, samples.trend.shape[1]))
 
     def add(some: slice) -> None:
         add_up(*_looked_at(samples, tissue, place, some), sums[some], with_trend[some])
@@ -209,37 +215,32 @@ def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
 
 
 def _explained(sums: Float, with_trend: Float, counts: Integer) -> _Fit:
-    """Variance explained by blood and walls beyond the trend, blood darker than the rest."""
-    blood_grey, wall_grey = sums[:, 0], sums[:, 1]
-    ridge = _RIDGE * counts
-    normal = sums[:, [[2, 3], [3, 4]]] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
-    normal[:, [0, 1], [0, 1]] += ridge[:, None]
-    bb, bw, ww = normal[:, 0, 0], normal[:, 0, 1], normal[:, 1, 1]
-    # Normal equations of two unknowns, solved by hand for all frames at once.
-    determinant = bb * ww - bw**2
-    blood = (ww * blood_grey - bw * wall_grey) / determinant
-    wall = (bb * wall_grey - bw * blood_grey) / determinant
+    """Variance explained by the model's parts beyond the trend, blood darker than the rest."""
+    grey = sums[:, :PARTS]
+    normal = sums[:, _PRODUCTS] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
+    normal[:, range(PARTS), range(PARTS)] += _RIDGE * counts[:, None]
+    coefficients = np.linalg.solve(normal, grey[..., None])[..., 0]
     # A fit that makes blood bright is one by chance: then only the walls count.
-    wall = np.where(blood < 0, wall, wall_grey / ww)
-    blood = np.minimum(blood, 0)
-    explained = np.clip((blood * blood_grey + wall * wall_grey) / counts, 0, 0.999)
-    return _Fit(explained, np.stack([blood, wall], axis=1), normal, sums, with_trend)
+    fitted = np.ones(coefficients.shape, dtype=bool)
+    bright = coefficients[:, 0] > 0
+    fitted[bright] = [False, True, False]
+    fitted[:, 2] &= coefficients[:, 2] < 0
+    normal = np.where(fitted[:, :, None] & fitted[:, None], normal, np.eye(PARTS))
+    coefficients = np.linalg.solve(normal, np.where(fitted, grey, 0)[..., None])[..., 0]
+    explained = np.clip((coefficients * grey).sum(axis=1) / counts, 0, 0.999)
+    return _Fit(explained, coefficients, normal, fitted, sums, with_trend)
 
 
 def _expanded(
     fit: _Fit, counts: Integer, pushes: Float, squares: Float, with_trend: Float
 ) -> Expansion:
     """Slopes and curvature from what `bend` has added up."""
-    # What blood and wall change where the trend is taken out of them.
+    # What the parts change where the trend is taken out of them.
     beyond = pushes[:, 1:] - np.einsum("fit,fct->fci", with_trend, fit.with_trend)
     rest = pushes[:, 0] - np.einsum("fc,fci->fi", fit.coefficients, beyond)
     bent = squares - np.einsum("fit,fjt->fij", with_trend, with_trend)
-    fitted = np.linalg.solve(fit.normal, beyond)
-    # Where blood would be bright, walls are all that is fitted.
-    dark = (fit.coefficients[:, 0] < 0)[:, None]
-    fitted[:, 0] = np.where(dark, fitted[:, 0], 0)
-    fitted[:, 1] = np.where(dark, fitted[:, 1], beyond[:, 1] / fit.normal[:, 1, 1, None])
-    bent -= np.einsum("fci,fcj->fij", beyond, fitted)
+    beyond = np.where(fit.fitted[..., None], beyond, 0)
+    bent -= np.einsum("fci,fcj->fij", beyond, np.linalg.solve(fit.normal, beyond))
     worth = 2 / (counts * (1 - fit.explained))
     slopes = -worth[:, None] * rest
     return Expansion(np.log1p(-fit.explained), slopes, np.einsum("f,fij->ij", worth, bent))

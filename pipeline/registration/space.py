@@ -24,6 +24,7 @@ from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
 from pipeline.registration.misplaced import by_chance
+from pipeline.registration.open_ends import open_ends
 from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.reading import as_compared
@@ -51,8 +52,9 @@ from pipeline.registration.verdict import (
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
 _STEPS = 5
-# By what share of its usual error a model is further off for each surface of blood that it lacks.
-_LACKING = 0.2
+# By what share of its usual error a model is further off for each surface of blood that it lacks,
+# and for each that goes on where the images end.
+_LACKING, _CUT = 0.2, 0.1
 # Of each surface, to look at the expected error.
 _POINTS = 200
 
@@ -220,8 +222,11 @@ def find(
         require_rigid(start, "initial mr_from_tracker")
     require_frames(sweeps, phases, settings)
     lacking = [name for name in BLOOD if name not in surfaces]
-    if lacking:
-        wider_mm = settings.model_error_mm * (1 + _LACKING * len(lacking))
+    ends = [] if cine is None else open_ends(surfaces, cine)
+    cut = sorted({name for end in ends for name in end.chambers}, key=BLOOD.index)
+    if lacking or cut:
+        further = _LACKING * len(lacking) + _CUT * len(cut)
+        wider_mm = settings.model_error_mm * (1 + further)
         settings = settings.model_copy(update={"model_error_mm": wider_mm})
     search = prepare_search(phases, surfaces, start, settings, cine)
     compared = as_compared(sweeps, settings)
@@ -254,6 +259,9 @@ def find(
     tell(_STEPS, _STEPS)
     if lacking and result.reason:
         said = f"the model lacks {', '.join(lacking)}, whose blood it takes for tissue"
+        result = replace(result, reason=f"{result.reason}; {said}")
+    if cut and result.reason:
+        said = f"the images end inside {', '.join(cut)}: what lies beyond is not known"
         result = replace(result, reason=f"{result.reason}; {said}")
     return result
 

@@ -23,6 +23,7 @@ from pipeline.field.winding import crossing
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
+from pipeline.registration.open_ends import OpenEnd, open_ends
 
 BLOOD = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium", "aorta")
 """The structures that hold blood."""
@@ -48,8 +49,8 @@ class TissueMap:
     """Blood and its walls around every node, through the beat."""
 
     share: Float32
-    """``(phase, z, y, x, 2)``: share of blood (or how dark it looks, see `as_seen`), and nearness
-    of its wall, each from 0 to 1."""
+    """``(phase, z, y, x, 2 or 3)``: share of blood (or how dark it looks, see `as_seen`), nearness
+    of a wall, and, where images end inside a chamber, of what may be blood; each from 0 to 1."""
 
     phases: Float
     """``(phase,)`` in [0, 1), rising."""
@@ -59,16 +60,22 @@ class TissueMap:
 
 
 def draw_tissue(
-    surfaces: Mapping[str, MovingSurface], spacing_mm: float, cine: Cine | None = None
+    surfaces: Mapping[str, MovingSurface],
+    spacing_mm: float,
+    cine: Cine | None = None,
+    muscle: bool = True,
 ) -> TissueMap:
     """Blood and walls on a grid that holds all cavities in all phases with a margin.
 
     Parameters
     ----------
     cine
-        What the surfaces were found in: what it shows of muscle inside the ventricles is no blood
-        (`pipeline.registration.cavity_muscle`). None, or no epicardium to tell the grey of muscle
-        by: the cavities are all blood.
+        What the surfaces were found in: where its slices end inside a chamber, what lies beyond is
+        open (`pipeline.registration.open_ends`). None: chambers end where their surfaces do.
+    muscle
+        Whether what the cine shows of muscle inside the ventricles is no blood
+        (`pipeline.registration.cavity_muscle`). Without a cine, or an epicardium to tell the grey
+        of muscle by, the cavities are all blood.
 
     Raises
     ------
@@ -78,9 +85,11 @@ def draw_tissue(
     cavities = cavities_of(surfaces)
     phases = cavities[0].phases
     names = [name for name in BLOOD if name in surfaces]
-    grid = _grid_around(cavities, spacing_mm)
-    share = np.empty((len(phases), *grid.shape, 2), dtype=np.float32)
-    seen = None if cine is None else CineOnGrid.of(cine, phases, grid)
+    ends = [] if cine is None else open_ends(surfaces, cine)
+    grid = _grid_around(cavities, spacing_mm, ends)
+    beyond = [end.over(grid) for end in ends]
+    share = np.empty((len(phases), *grid.shape, 3 if beyond else 2), dtype=np.float32)
+    seen = CineOnGrid.of(cine, phases, grid) if cine is not None and muscle else None
     grey = None if seen is None else _grey_of_muscle(seen, surfaces, names, grid)
 
     def draw(index: int) -> None:
@@ -89,9 +98,14 @@ def draw_tissue(
         if seen is not None and grey is not None:
             ventricles = np.minimum(sum(covered[name] for name in names if name in VENTRICLES), 1)
             blood = blood - seen.muscle_inside(index, blood, ventricles, grey)
-        soft = gaussian_filter(blood, _WALL_MM / spacing_mm, mode="constant")
-        share[index, ..., 0] = blood
-        share[index, ..., 1] = 4 * soft * (1 - soft)
+        carried = np.zeros_like(blood)
+        for end in beyond:
+            carried = np.maximum(carried, end.carried(blood))
+        soft = gaussian_filter(np.maximum(blood, carried), _WALL_MM / spacing_mm, mode="constant")
+        wall = 4 * soft * (1 - soft)
+        for end in beyond:
+            blood, wall = np.where(end.outside, 0, blood), np.where(end.outside, 0, wall)
+        share[index] = np.stack([blood, wall, carried][: share.shape[-1]], axis=-1)
 
     _in_turn(draw, len(phases))
     return TissueMap(share, phases, grid)
@@ -167,9 +181,10 @@ def as_seen(tissue: TissueMap) -> TissueMap:
     share = tissue.share.copy()
 
     def see(index: int) -> None:
-        blood = gaussian_filter(tissue.share[index, ..., 0], width, mode="constant")
-        dark = np.log(np.maximum(1 - blood, 0) + _ECHO_OF_BLOOD) / np.log(_ECHO_OF_BLOOD)
-        share[index, ..., 0] = np.clip(dark, 0, 1)
+        for part in range(0, share.shape[-1], 2):
+            blood = gaussian_filter(tissue.share[index, ..., part], width, mode="constant")
+            dark = np.log(np.maximum(1 - blood, 0) + _ECHO_OF_BLOOD) / np.log(_ECHO_OF_BLOOD)
+            share[index, ..., part] = np.clip(dark, 0, 1)
 
     _in_turn(see, len(share))
     return TissueMap(share, tissue.phases, tissue.grid)
@@ -215,9 +230,12 @@ def coverage(surface: Surface, grid: Grid) -> Float32:
     return np.asarray(total / 3, dtype=np.float32)
 
 
-def _grid_around(surfaces: Sequence[MovingSurface], spacing_mm: float) -> Grid:
-    lower = np.min([s.vertices_mm.min(axis=(0, 1)) for s in surfaces], axis=0) - _MARGIN_MM
-    upper = np.max([s.vertices_mm.max(axis=(0, 1)) for s in surfaces], axis=0) + _MARGIN_MM
+def _grid_around(
+    surfaces: Sequence[MovingSurface], spacing_mm: float, ends: Sequence[OpenEnd]
+) -> Grid:
+    points_mm = np.concatenate([one.vertices_mm.reshape(-1, 3) for one in surfaces])
+    points_mm = np.concatenate([points_mm, *(one.reached(points_mm) for one in ends)])
+    lower, upper = points_mm.min(axis=0) - _MARGIN_MM, points_mm.max(axis=0) + _MARGIN_MM
     x, y, z = (int(count) for count in np.ceil((upper - lower) / spacing_mm) + 1)
     origin_mm = (float(lower[0]), float(lower[1]), float(lower[2]))
     return Grid((z, y, x), origin_mm, (spacing_mm, spacing_mm, spacing_mm))
