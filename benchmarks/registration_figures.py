@@ -46,10 +46,12 @@ from registration_studies import (
 )
 from registration_tables import tables
 
+from data_synth.heart import BeatingHeart
 from data_synth.pathology import PATHOLOGIES
 from data_synth.simulate import load_heart
 from pipeline.errors import BeatfieldError
-from pipeline.geometry import Float, MovingSurface, transform_points
+from pipeline.exact import ExactSurface, points_about
+from pipeline.geometry import Float, MovingSurface, Surface, transform_points
 from pipeline.imaging.cine import Cine
 from pipeline.products import read_cine
 from pipeline.registration.settings import RegisterSettings
@@ -60,6 +62,7 @@ from pipeline.registration.uncertainty import motion_between
 FRAMES = "48,24,40,12,48,32,16"
 DROPOUT = (0.0, 0.2, 0.0, 0.4, 0.6)
 SNR_DB = (None, 20.0, 10.0)
+CHAMBERS = ("lv_endocardium", "epicardium", "rv_endocardium", "left_atrium", "right_atrium")
 Model = tuple[dict[str, MovingSurface], Cine | None]
 SHARES = (1.0, 0.5, 0.75, 0.25)
 """Of 20 mm and 20 degrees: how far off the starts of a study are, in turn."""
@@ -94,6 +97,23 @@ def error_mm(study: Study, pose: Float) -> Float:
     return np.asarray(np.linalg.norm(transform_points(pose, tracker) - shown_mm, axis=1))
 
 
+def walls_mm(
+    heart: BeatingHeart, study: Study, surfaces: dict[str, MovingSurface], pose: Float
+) -> float:
+    """How far the chambers' walls truly are from where surfaces and pose together put them: the
+    mean over points all over them, at three moments of the beat. This is what a tool feels."""
+    rng, away_mm = np.random.default_rng(5), []
+    shown_from_true = pose @ np.linalg.inv(study.mr_from_tracker)
+    for name in (one for one in CHAMBERS if one in surfaces):
+        moving = surfaces[name]
+        for k in np.linspace(0, len(moving.phases), 3, endpoint=False).astype(int):
+            true = Surface(*heart.surfaces(float(moving.phases[k]), [name])[name])
+            found = ExactSurface(Surface(moving.vertices_mm[k], moving.triangles))
+            points = points_about(true, rng, 300, 0.0)
+            away_mm.append(found.distance_mm(transform_points(shown_from_true, points)))
+    return float(np.abs(away_mm).mean())
+
+
 def with_pixels_wrong(
     study: Study, surfaces: dict[str, MovingSurface], cine: Cine, factor: float
 ) -> tuple[Study, dict[str, MovingSurface], Cine]:
@@ -116,16 +136,16 @@ def registered(
     cine: Cine | None,
     start: Float | None,
     settings: RegisterSettings,
-) -> dict[str, Any]:
-    """One registration: errors, verdict and seconds."""
+) -> tuple[dict[str, Any], Float | None]:
+    """One registration: errors, verdict and seconds; and the pose."""
     began = time.perf_counter(), time.process_time()
     try:
         found = find(study.sweeps, study.phases, surfaces, start, settings, cine=cine)
     except BeatfieldError as refusal:
-        return {"verdict": "refused", "reason": str(refusal)}
+        return {"verdict": "refused", "reason": str(refusal)}, None
     wall_s, cpu_s = time.perf_counter() - began[0], time.process_time() - began[1]
     error = error_mm(study, found.mr_from_tracker)
-    return {
+    measured = {
         "mean_mm": float(error.mean()),
         "quantiles_mm": np.quantile(error, np.linspace(0, 1, 21)).tolist(),
         "expected_mm": found.expected_mm,
@@ -145,6 +165,7 @@ def registered(
         "wall_s": wall_s,
         "cpu_s": cpu_s,
     }
+    return measured, found.mr_from_tracker
 
 
 def peer(order: Order, study: Study, start: Float) -> dict[str, Any]:
@@ -220,7 +241,12 @@ def result_of(
         known = None if method == "global" else guess
         corrected = "per_sweep" if method == "per_sweep" else "fixed"
         settings = RegisterSettings(calibration=corrected, reading=arguments.reading)
-        measured = registered(study, surfaces, cine, known, settings)
+        measured, pose = registered(study, surfaces, cine, known, settings)
+        if products is not None and pose is not None:
+            heart = load_heart(order.settings())
+            true = np.asarray(study.shown_from_mr @ study.mr_from_tracker)
+            measured["walls_mm"] = walls_mm(heart, study, surfaces, pose)
+            measured["walls_if_true_mm"] = walls_mm(heart, study, surfaces, true)
     about = {"study": order.name, "method": method, "start": start, "share": share}
     keys = ("probe", "frames", "dropout", "snr_db", "pathology")
     return about | {key: getattr(order, key) for key in keys} | measured

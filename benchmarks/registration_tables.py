@@ -59,7 +59,7 @@ def tables(results: list[dict[str, Any]]) -> str:
         text += ["", f"By {key}:", "", HEAD]
         for value in sorted({one[key] for one in ours}, key=_rank):
             text.append(line(str(value), [one for one in ours if one[key] == value]))
-    text += ["", *calibration(ours)]
+    text += ["", *walls(ours), *calibration(ours)]
     corrected = [one for one in results if one["method"] == "per_sweep"]
     if corrected:
         text += ["", "With calibration: per_sweep:", "", HEAD]
@@ -99,6 +99,23 @@ def calibration(results: list[dict[str, Any]]) -> list[str]:
     for part in parts:
         text += ["", *part]
     return text
+
+
+def walls(results: list[dict[str, Any]]) -> list[str]:
+    """How far chambers' walls are from where they are said to be, as a tool feels it."""
+    some = [one for one in results if "walls_mm" in one]
+    if not some:
+        return []
+    placed, best = (
+        np.array([one[key] for one in some]) for key in ("walls_mm", "walls_if_true_mm")
+    )
+    return [
+        f"Walls of the chambers from where surfaces and pose put them, mean of a study: median "
+        f"{np.median(placed):.2f} mm, 95th percentile {np.quantile(placed, 0.95):.2f}, worst "
+        f"{placed.max():.2f}; with the true pose {np.median(best):.2f}, "
+        f"{np.quantile(best, 0.95):.2f}, {best.max():.2f}.",
+        "",
+    ]
 
 
 def sizes(results: list[dict[str, Any]]) -> list[str]:
