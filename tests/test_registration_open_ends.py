@@ -27,7 +27,9 @@ from pipeline.registration.tissue_map import blurred, draw_tissue
 LAST_MM = 68.0
 """Height of the last slice's middle over the mitral plane: half of the left atrium lies beyond."""
 STEP_MM = 8.0
-GREY = RegisterSettings(reading="grey", candidates=1, starts=1, capture_mm=10, capture_deg=10)
+GREY = RegisterSettings(
+    reading="grey", candidates=1, starts=1, capture_mm=10, capture_deg=10, grid_mm=3.0
+)
 
 
 def height_mm(points_mm):
@@ -157,7 +159,7 @@ def test_a_model_cut_off_draws_the_pose_along_unless_the_stack_says_where_it_end
 
 
 def test_a_result_by_a_stack_that_ends_in_chambers_is_less_sure_and_says_so(whole, recording):
-    quick = GREY.model_copy(update={"max_frames": 12, "grid_mm": 3.0, "good_tre_mm": 0.1})
+    quick = GREY.model_copy(update={"max_frames": 12, "good_tre_mm": 0.1})
     given = recording.sweeps, recording.phases, cut(whole), recording.mr_from_tracker, quick
     blind, told = find(*given), find(*given, cine=stack())
     assert told.expected_mm > 1.1 * blind.expected_mm

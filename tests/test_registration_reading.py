@@ -69,19 +69,18 @@ def test_blood_is_found_better_than_any_grey_level_tells(drawn):
 def test_blood_is_found_in_pictures_of_a_renderer_that_shares_nothing_with_training():
     """Other anatomy, other physics of the picture, other consoles; by every kind of probe."""
     scores = []
-    for seed in (401, 402):
-        for examination in EXAMINATIONS:
-            made = outside_record(seed, person(seed), examination, frames=2)
-            for sweep, truth in zip(made.sweeps, made.blood, strict=True):
-                reader = Reader.of(sweep)
-                found = reader.read(sweep.images) > 0.5
-                rows, columns = np.mgrid[: found.shape[1], : found.shape[2]].astype(np.float32)
-                at = columns * np.float32(reader.step[0]), rows * np.float32(reader.step[1])
-                for one, blood in zip(found, truth, strict=True):
-                    seen = cv2.remap(blood.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.5
-                    if seen.mean() > 0.03:
-                        scores.append(dice(one, seen))
-    assert len(scores) >= 18
+    for seed, examination in enumerate(EXAMINATIONS, 401):
+        made = outside_record(seed, person(seed), examination, frames=2)
+        for sweep, truth in zip(made.sweeps, made.blood, strict=True):
+            reader = Reader.of(sweep)
+            found = reader.read(sweep.images) > 0.5
+            rows, columns = np.mgrid[: found.shape[1], : found.shape[2]].astype(np.float32)
+            at = columns * np.float32(reader.step[0]), rows * np.float32(reader.step[1])
+            for one, blood in zip(found, truth, strict=True):
+                seen = cv2.remap(blood.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.5
+                if seen.mean() > 0.03:
+                    scores.append(dice(one, seen))
+    assert len(scores) >= 9
     assert np.median(scores) > 0.85
 
 

@@ -219,14 +219,14 @@ def _explained(sums: Float, with_trend: Float, counts: Integer) -> _Fit:
     grey = sums[:, :PARTS]
     normal = sums[:, _PRODUCTS] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
     normal[:, range(PARTS), range(PARTS)] += _RIDGE * counts[:, None]
-    coefficients = np.linalg.solve(normal, grey[..., None])[..., 0]
-    # A fit that makes blood bright is one by chance: then only the walls count.
-    fitted = np.ones(coefficients.shape, dtype=bool)
-    bright = coefficients[:, 0] > 0
-    fitted[bright] = [False, True, False]
-    fitted[:, 2] &= coefficients[:, 2] < 0
-    normal = np.where(fitted[:, :, None] & fitted[:, None], normal, np.eye(PARTS))
-    coefficients = np.linalg.solve(normal, np.where(fitted, grey, 0)[..., None])[..., 0]
+    fitted, every = np.ones(grey.shape, dtype=bool), normal
+    # Two parts may be left out, one after the other; the last solution leaves out none.
+    for _ in range(PARTS):
+        normal = np.where(fitted[:, :, None] & fitted[:, None], every, np.eye(PARTS))
+        coefficients = np.linalg.solve(normal, np.where(fitted, grey, 0)[..., None])[..., 0]
+        # A fit that makes blood bright is one by chance: then only the walls count.
+        fitted[coefficients[:, 0] > 0] = [False, True, False]
+        fitted[:, 2] &= coefficients[:, 2] < 0
     explained = np.clip((coefficients * grey).sum(axis=1) / counts, 0, 0.999)
     return _Fit(explained, coefficients, normal, fitted, sums, with_trend)
 
