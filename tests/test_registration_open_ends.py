@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from ellipsoid_heart import (
@@ -12,6 +14,7 @@ from ellipsoid_heart import (
     record,
 )
 from scipy.ndimage import map_coordinates
+from scipy.optimize import lsq_linear
 
 from pipeline.geometry import MovingSurface, transform_points
 from pipeline.imaging.cine import Cine
@@ -114,6 +117,30 @@ def test_beyond_the_end_blood_is_carried_on_and_below_all_is_as_it_was(whole):
     at = ((places_mm[low] - other.grid.origin_mm) / 2.5)[:, ::-1].T
     there = map_coordinates(other.share[0, ..., 0], at, order=1)
     assert np.abs(there - blood[low]).mean() < 0.01
+
+
+def test_explained_share_is_that_of_a_bounded_least_squares_fit(whole, recording):
+    """Against a general solver, blood and what is carried on dark; walls are free."""
+    tissue = blurred(draw_tissue(cut(whole, 56.0), 2.5, stack(56.0), muscle=False), 1.5)
+    sweep, pose = recording.sweeps[0], recording.mr_from_tracker
+    samples = sample_frames([sweep], [np.full(len(sweep.images), PHASES[3])], 4.0, 1.5, 20.0)
+    nodes = transform_points(pose, samples.points_mm.astype(float)) - tissue.grid.origin_mm
+    nodes = (nodes / tissue.grid.spacing_mm).T[::-1]
+    model = [map_coordinates(tissue.share[3, ..., k], nodes, order=1) for k in range(3)]
+    found, of_it = agreement(samples, tissue, pose).explained, []
+    for frame, (first, last) in enumerate(pairwise(samples.first)):
+        row = samples.trend_row[frame]
+        trend = samples.trend[row : row + last - first].astype(float)
+        grey = samples.grey[first:last].astype(float)
+        shares = np.column_stack([share[first:last] for share in model])
+        shares -= trend @ np.linalg.lstsq(trend, shares)[0]
+        # The ridge, 1e-3 a sample, as rows of its own.
+        ridged = np.vstack([shares, np.sqrt(1e-3 * len(grey)) * np.eye(3)])
+        best = lsq_linear(ridged, np.append(grey, [0, 0, 0]), ([-np.inf] * 3, [0, np.inf, 0])).x
+        if best[0] < -1e-6:
+            assert found[frame] == pytest.approx(best @ (shares.T @ grey) / len(grey), abs=2e-4)
+            of_it.append(best[2] < -1e-6)
+    assert sum(of_it) >= 5
 
 
 def test_slopes_are_those_of_the_losses_with_blood_carried_on(whole, recording):

@@ -1,10 +1,11 @@
 """How well frames and model agree at a pose: the share of grey values that anatomy explains.
 
-The smoothed grey values of every frame, as ranks, are fitted by ``a + b * blood + c * wall`` and a
-trend across the sector, so that no gain, no compression and no scanner needs to be known; what
-the fit explains beyond the trend is the frame's correlation ratio. The trend takes in all that
-changes over centimetres: fading behind tissue, shadow, haze, and how bright what lies around the
-heart is. Left in, it draws the pose towards where it is strong. After W. Wein et al.,
+The smoothed grey values of every frame, as ranks, are fitted by ``a + b * blood + c * wall``, by
+blood carried on where the images end inside a chamber (`open_ends`), no brighter than the rest
+either, and by a trend across the sector, so that no gain, no compression and no scanner needs to be
+known; what the fit explains beyond the trend is the frame's correlation ratio. The trend takes in
+all that changes over centimetres: fading behind tissue, shadow, haze, and how bright what lies
+around the heart is. Left in, it draws the pose towards where it is strong. After W. Wein et al.,
 "Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention", Med
 Image Anal 12 (2008) 577-585, with surfaces in the place of CT numbers.
 """
