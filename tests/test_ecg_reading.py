@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.sequence import Sequence
-from pydicom.uid import ExplicitVRLittleEndian
+from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian
 
 from pipeline.errors import InputError
 from pipeline.imaging.ecg import other_patient, patient_mark, read_ecg
@@ -284,8 +284,16 @@ def test_every_constant_lead_is_named(tmp_path):
 def test_unit_that_is_no_voltage_is_refused(tmp_path, kind):
     path = write_wfdb(tmp_path, units="mmHg") if kind == "wfdb" else None
     path = path or write_dicom(tmp_path / "ecg.dcm", unit="mm[Hg]")
-    with pytest.raises(InputError, match="voltage"):
+    with pytest.raises(
+        InputError, match=r"channel 'I' is in 'mm.*voltage.*: take it out, for press"
+    ):
         read_ecg(path)
+
+
+@pytest.mark.parametrize("unit", ["adu", "1"])
+def test_a_lead_that_was_not_calibrated_is_no_pressure(tmp_path, unit):
+    with pytest.raises(InputError, match=r"not calibrated, write mV: its scale changes no R peak"):
+        read_ecg(write_wfdb(tmp_path, units=unit))
 
 
 def test_csv_gap_is_refused(tmp_path):
@@ -393,6 +401,32 @@ def test_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
         read_ecg(tmp_path / "ecg.csv")
 
 
+def test_a_csv_of_windows_is_told_by_its_micro_sign(tmp_path):
+    path = write_csv(tmp_path / "ecg.csv")
+    for text, encoding in (("I (µV)", "cp1252"), ("I (µV)", "utf-8"), ("I_uV", "utf-8")):
+        path.write_bytes(
+            path.read_bytes().replace(b"time_s,I,", f"time_s,{text},".encode(encoding))
+        )
+        with pytest.raises(InputError, match=r"is in [µu]V; .*: write the values so, and \(mV\)"):
+            read_ecg(path)
+        write_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("s,mV,mV", "delete it if it gives units"),
+        ('"0.004","0.1","0.1"', "mend it"),
+        ("12:00:00.000,0.1,0.1", "write times as seconds"),
+        (",,", "delete it, and all behind it, if the recording ends there"),
+    ],
+)
+def test_what_a_line_of_a_csv_lacks_is_told(tmp_path, line, told):
+    path = write_csv(tmp_path / "ecg.csv", header=f"time_s,I,II\n{line}")
+    with pytest.raises(InputError, match=rf"line 2: needs 3 numbers.*; {told}"):
+        read_ecg(path)
+
+
 def test_csv_in_utf_16_is_refused_with_the_remedy(tmp_path):
     (tmp_path / "ecg.csv").write_text("time_s,I\n0,1\n", encoding="utf-16-le")
     with pytest.raises(InputError, match="save it as UTF-8"):
@@ -458,3 +492,96 @@ def test_a_group_that_begins_later_than_its_record_has_its_own_start(tmp_path):
 def test_nanovolts_become_millivolts(tmp_path):
     stem = write_wfdb(tmp_path, units="nV")
     np.testing.assert_allclose(read_ecg(stem).signal_mv, STEPS_UV / 1000.0 * 1e-6, rtol=1e-9)
+
+
+def write_frames(folder, each, name="frames", skew=""):
+    """A record of format 16 by the text of the WFDB guide: each frame holds some samples of I, of
+    II, and one of a pressure."""
+    per_i, per_ii = each
+    frames = len(STEPS_UV) // max(each)
+    lead_i = STEPS_UV[:: max(each) // per_i, 0].reshape(frames, per_i)
+    lead_ii = STEPS_UV[:: max(each) // per_ii, 1].reshape(frames, per_ii)
+    stored = np.hstack([lead_i, lead_ii, np.arange(frames)[:, None] % 90]).astype("<i2")
+    (folder / f"{name}.dat").write_bytes(stored.tobytes())
+    lines = [
+        f"{name} 3 {RATE_HZ / max(each):g} {frames}",
+        f"{name}.dat 16x{per_i}{skew} 1000(0)/mV 16 0 0 0 0 I",
+        f"{name}.dat 16x{per_ii} 1000(0)/mV 16 0 0 0 0 II",
+        f"{name}.dat 16 1(0)/mmHg 16 0 0 0 0 ABP",
+    ]
+    (folder / f"{name}.hea").write_text("\n".join(lines) + "\n")
+    return folder / name
+
+
+def test_all_samples_of_a_wfdb_frame_are_read(tmp_path):
+    ecg = read_ecg(write_frames(tmp_path, (4, 4)), gaps=True)
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV / 1000.0, rtol=0, atol=1e-9)
+    assert (ecg.leads, ecg.sampling_rate_hz) == (("I", "II"), RATE_HZ)
+
+
+def test_leads_of_fewer_samples_than_others_are_left_out_or_refused(tmp_path):
+    stem = write_frames(tmp_path, (1, 4))
+    ecg = read_ecg(stem, gaps=True)
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV[:, 1:] / 1000.0, rtol=0, atol=1e-9)
+    assert (ecg.leads, ecg.sampling_rate_hz) == (("II",), RATE_HZ)
+    header = stem.with_suffix(".hea")
+    header.write_text(header.read_text().replace("1(0)/mmHg", "1(0)/mV"))
+    with pytest.raises(InputError, match=r"leads of different rates: I, ABP of fewer samples"):
+        read_ecg(stem)
+
+
+def test_a_lead_that_was_sampled_late_is_moved_and_the_end_is_cut(tmp_path):
+    ecg = read_ecg(write_frames(tmp_path, (1, 1), skew=":5"), gaps=True)
+    moved = np.column_stack([STEPS_UV[5:, 0], STEPS_UV[:-5, 1]])
+    np.testing.assert_allclose(ecg.signal_mv, moved / 1000.0, rtol=0, atol=1e-9)
+
+
+def test_a_dicom_waveform_of_the_other_byte_order_is_the_same(tmp_path):
+    steps = STEPS_UV.copy()
+    steps[7, 0] = -32768
+    group = waveform_group(steps, "uV")
+    group.WaveformData = steps.astype(">i2").tobytes()
+    group.WaveformPaddingValue = b"\x80\x00"
+    dataset = Dataset()
+    dataset.file_meta = FileMetaDataset()
+    dataset.file_meta.TransferSyntaxUID = ExplicitVRBigEndian
+    dataset.SOPClassUID = pydicom.uid.TwelveLeadECGWaveformStorage
+    dataset.SOPInstanceUID = "1.2.3"
+    dataset.WaveformSequence = Sequence([group])
+    dataset.save_as(tmp_path / "ecg.dcm", enforce_file_format=True)
+    wanted = np.where(steps == -32768, np.nan, steps / 1000.0)
+    np.testing.assert_allclose(read_ecg(tmp_path / "ecg.dcm", gaps=True).signal_mv, wanted)
+
+
+def test_a_dicom_waveform_without_preamble_is_read(tmp_path):
+    path = write_dicom(tmp_path / "ecg.dcm")
+    path.write_bytes(path.read_bytes()[132:])
+    np.testing.assert_allclose(read_ecg(path).signal_mv, STEPS_UV / 1000.0)
+
+
+def test_a_correction_or_a_baseline_that_is_empty_is_none(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    for one in group.ChannelDefinitionSequence:
+        one.ChannelBaseline = one.ChannelSensitivityCorrectionFactor = None
+    np.testing.assert_allclose(
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", [group])).signal_mv, STEPS_UV / 1000.0
+    )
+
+
+def test_samples_packed_as_telephones_do_are_refused(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    group.WaveformBitsAllocated, group.WaveformSampleInterpretation = 8, "MB"
+    group.WaveformData = (STEPS_UV % 256).astype(np.uint8).tobytes()
+    with pytest.raises(InputError, match="packed by mu-law"):
+        read_ecg(write_dicom(tmp_path / "ecg.dcm", [group]))
+
+
+def test_a_channel_of_a_dicom_group_that_is_no_voltage_is_left_out_beside_one(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    group.ChannelDefinitionSequence[1].ChannelSensitivityUnitsSequence = coded("Ohm", "resistance")
+    path = write_dicom(tmp_path / "ecg.dcm", [group])
+    ecg = read_ecg(path, gaps=True)
+    assert ecg.leads == ("I",)
+    np.testing.assert_allclose(ecg.signal_mv, STEPS_UV[:, :1] / 1000.0)
+    with pytest.raises(InputError, match="channel 'II' is in 'Ohm'"):
+        read_ecg(path)

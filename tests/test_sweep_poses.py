@@ -288,3 +288,44 @@ def test_a_reference_that_rests_by_two_poses_of_the_probe_is_left_alone(tmp_path
         fields[f"Seq_Frame{k:04d}_{PROBE_TO_REFERENCE}"] = text(pose)
     (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
     np.testing.assert_allclose(sweep.tracker_from_reference, [reference(0)] * FRAMES, atol=1e-6)
+
+
+def test_the_identity_is_no_pose_of_a_reference_but_where_it_rests(tmp_path):
+    fields = without(with_reference(), "Status")
+    for k in (1, 3):
+        fields[f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"] = text(np.eye(4))
+    sweep = read_sweep(write(tmp_path / "s.mha", fields), "Reference")
+    assert sweep.numbers.tolist() == [0, 2, 4]
+    assert sweep.remarks == ("2 of 5 frames left out, which have no valid picture or pose",)
+    for at, k in enumerate(sweep.numbers):
+        np.testing.assert_allclose(sweep.tracker_from_probe[at], followed(k), atol=1e-9)
+    for k in range(FRAMES):
+        fields[f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"] = text(np.eye(4))
+    sweep = read_sweep(write(tmp_path / "s.mha", fields), "Reference")
+    np.testing.assert_allclose(sweep.tracker_from_probe, [rigid(k) for k in range(FRAMES)])
+
+
+def test_a_reference_unseen_for_some_frames_does_not_move(tmp_path):
+    fields = without(with_reference(), "Status")
+    for k in range(FRAMES):
+        place = np.eye(4) if k == 2 else reference(1)
+        fields[f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"] = text(place)
+    (sweep,) = read_sweeps(files(write(tmp_path / "s.mha", fields)))
+    assert len(sweep.numbers) == FRAMES
+    assert len(sweep.tracker_from_reference) == FRAMES - 1
+
+
+def test_a_size_of_pixels_beside_the_calibration_is_told_and_instead_of_it_refused(tmp_path):
+    """PLUS looks at the calibration alone, 3D Slicer multiplies the two."""
+    image = sitk.ReadImage(str(write(tmp_path / "s.mha", good_fields())))
+    image.SetSpacing((0.2, 0.3, 1.0))
+    sitk.WriteImage(image, str(tmp_path / "s.mha"))
+    [told] = read_sweep(tmp_path / "s.mha").remarks
+    assert told.startswith("ElementSpacing of 0.2 by 0.3 mm is not looked at")
+    for k in range(FRAMES):
+        image.SetMetaData(f"Seq_Frame{k:04d}_ImageToProbeTransform", text(calibration(1.0)))
+    sitk.WriteImage(image, str(tmp_path / "s.mha"))
+    with pytest.raises(InputError, match=r"pixels of 0\.2 by 0\.3 mm and ImageToProbe takes each"):
+        read_sweep(tmp_path / "s.mha")
+    given = calibration() @ np.eye(4)
+    assert len(read_sweep(tmp_path / "s.mha", probe_from_image=given).remarks) == 1

@@ -57,6 +57,11 @@ def test_an_orientation_that_is_none_is_refused(tmp_path):
 def test_what_is_no_picture_as_it_is_shown_is_refused(tmp_path):
     fields = good_fields() | {"UltrasoundImageType": "BRIGHTNESS"}
     assert read_sweep(write(tmp_path / "s.mha", fields)).remarks == ()
+    # Of three colours each, all alike, as some grabbers store grey.
+    fields["UltrasoundImageType"] = "RGB_COLOR"
+    alike = np.repeat(PIXELS[..., None], 3, axis=-1)
+    sweep = read_sweep(write(tmp_path / "s.mha", fields, alike, vector=True))
+    np.testing.assert_array_equal(sweep.images, PIXELS)
     fields["UltrasoundImageType"] = "RF_REAL"
     with pytest.raises(InputError, match="UltrasoundImageType is RF_REAL; it needs the brightness"):
         read_sweep(write(tmp_path / "s.mha", fields))
@@ -332,3 +337,8 @@ def test_colour_frames_are_refused(tmp_path):
     colour[0, 0, 0, 2] += 1
     with pytest.raises(InputError, match="3 values a pixel"):
         read_sweep(write(tmp_path / "s.mha", good_fields(), colour, vector=True))
+    # As PLUS stores it.
+    kinds = b"Kinds = vector domain domain list\nDimSize = 3 17 12 5"
+    grey.write_bytes(grey.read_bytes().replace(b"DimSize = 17 12 5", kinds))
+    with pytest.raises(InputError, match="has 3 values a pixel .Kinds begins with vector"):
+        read_sweep(grey)

@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Mask
+from pipeline.imaging.dicom_files import is_bare
 from pipeline.imaging.ecg_csv import read_csv
 from pipeline.imaging.voltages import is_voltage, millivolts
 from pipeline.study_files import names_in_header
@@ -65,7 +66,7 @@ def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
         first column ``time_s``, then one column of millivolts a lead), or a DICOM waveform file.
     gaps
         Take leads with missing samples (not a number then) and constant ones too, as long as there
-        is another; leave out channels of a WFDB record that are no voltage.
+        is another; leave out channels that are no voltage, and those of fewer samples a second.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def read_ecg(path: Path, *, gaps: bool = False) -> Ecg:
     elif path.suffix.lower() == ".csv":
         ecg = Ecg(*read_csv(path))
     else:
-        ecg = _read_dicom(path)
+        ecg = _read_dicom(path, gaps)
     _require_usable(ecg, path, gaps)
     return ecg
 
@@ -112,7 +113,9 @@ def _read_wfdb(header: Path, gaps: bool) -> Ecg:
         _require_plain_units(header)
         with _quiet_wfdb() as wfdb:
             _require_one_way_of_writing(wfdb, header)
-            record = wfdb.rdrecord(str(header.with_suffix("").absolute()), return_res=64)
+            stem = str(header.with_suffix("").absolute())
+            # Frames may hold several samples of a lead: all of them, not their mean.
+            record = wfdb.rdrecord(stem, return_res=64, smooth_frames=False)
     except InputError:
         raise
     # The library raises its parser's own errors (IndexError, TypeError ...) on damaged files.
@@ -171,23 +174,35 @@ def _require_one_way_of_writing(wfdb: Any, header: Path) -> None:
 
 def _wfdb_leads(record: Any, header: Path, gaps: bool) -> Ecg:
     """The channels of a record in millivolts."""
-    if record.p_signal is None or not record.n_sig:
+    if record.e_p_signal is None or not record.n_sig:
         raise InputError(f"{header}: holds no signal; a WFDB record of an ECG is needed")
     voltages = [k for k, unit in enumerate(record.units) if is_voltage(unit)]
     kept = voltages if gaps and voltages else list(range(record.n_sig))
-    factors = [millivolts(record.units[k], str(header)) for k in kept]
-    signal_mv = np.asarray(record.p_signal, dtype=float)[:, kept] * factors
     # A header need not name its signals.
-    names = tuple(record.sig_name[k] or f"signal {k + 1}" for k in kept)
-    return Ecg(signal_mv, names, float(record.fs))
+    names = {k: record.sig_name[k] or f"signal {k + 1}" for k in kept}
+    factors = {k: millivolts(record.units[k], names[k], str(header)) for k in kept}
+    each = [count or 1 for count in record.samps_per_frame or [1] * record.n_sig]
+    most = max(each[k] for k in kept)
+    slower = [names[k] for k in kept if each[k] < most]
+    if slower and not gaps:
+        raise InputError(
+            f"{header}: has leads of different rates: {', '.join(slower)} of fewer samples a "
+            "second than the others; leave them out of the file"
+        )
+    kept = [k for k in kept if each[k] == most]
+    # What a lead's skew has moved up leaves its end empty.
+    frames = record.sig_len - max(moved or 0 for moved in record.skew or [0])
+    leads = [np.asarray(record.e_p_signal[k], float)[: frames * most] * factors[k] for k in kept]
+    signal_mv = np.stack(leads, axis=1)
+    return Ecg(signal_mv, tuple(names[k] for k in kept), float(record.fs) * most)
 
 
-def _read_dicom(path: Path) -> Ecg:
+def _read_dicom(path: Path, gaps: bool) -> Ecg:
     """Read the longest group of voltages in a DICOM waveform file."""
     import pydicom
 
     try:
-        dataset = pydicom.dcmread(path)
+        dataset = pydicom.dcmread(path, force=is_bare(path))
     except Exception as error:
         raise InputError(
             f"{path}: is neither a WFDB record, nor .csv, nor DICOM ({error}); convert it to one"
@@ -202,7 +217,36 @@ def _read_dicom(path: Path) -> Ecg:
         raise InputError(
             f"{path}: how long its waveforms are cannot be understood ({error}); export it again"
         ) from error
-    return _dicom_group(dataset, longest, path)
+    _mend_group(dataset, groups[longest], path)
+    return _dicom_group(dataset, longest, path, gaps)
+
+
+def _mend_group(dataset: Any, group: Any, path: Path) -> None:
+    """Make of a multiplex group what the library decodes rightly.
+
+    Raises
+    ------
+    InputError
+        When its samples are packed as telephones do, which the library takes for plain ones.
+    """
+    kind = str(group.get("WaveformSampleInterpretation", ""))
+    if kind in ("MB", "AB"):
+        law = {"MB": "mu-law", "AB": "A-law"}[kind]
+        raise InputError(
+            f"{path}: its samples are packed by {law} (WaveformSampleInterpretation {kind}); "
+            "export plain ones"
+        )
+    size = int(group.get("WaveformBitsAllocated") or 0) // 8
+    if not dataset.original_encoding[1] and size in (2, 4):
+        for name in ("WaveformData", "WaveformPaddingValue"):
+            if stored := group.get(name):
+                swapped = np.frombuffer(stored, f"u{size}").byteswap().tobytes()
+                setattr(group, name, swapped)
+    for channel in group.get("ChannelDefinitionSequence") or []:
+        # Present and empty says what their absence does.
+        for name in ("ChannelBaseline", "ChannelSensitivityCorrectionFactor"):
+            if channel.get(name, 0) is None:
+                delattr(channel, name)
 
 
 def _seconds(group: Any) -> tuple[bool, float]:
@@ -217,7 +261,7 @@ def _seconds(group: Any) -> tuple[bool, float]:
     return voltages, samples / rate_hz if rate_hz > 0 else samples
 
 
-def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
+def _dicom_group(dataset: Any, index: int, path: Path, gaps: bool) -> Ecg:
     """Decode one multiplex group of channels."""
     group = dataset.WaveformSequence[index]
     try:
@@ -236,9 +280,12 @@ def _dicom_group(dataset: Any, index: int, path: Path) -> Ecg:
             f"{path}: the waveform cannot be decoded ({error}); it needs complete samples, a "
             "sampling frequency, and a source and a unit for each channel; export it again"
         ) from error
-    scale = [millivolts(unit, str(path)) for unit in units]
+    voltages = [k for k, unit in enumerate(units) if is_voltage(unit)]
+    kept = voltages if gaps and voltages else list(range(len(units)))
+    scale = [millivolts(units[k], names[k], str(path)) for k in kept]
     patient = str(dataset.get("PatientID", "") or "").strip()
-    return Ecg(signal * scale, names, rate_hz, start_s, patient=patient)
+    leads = tuple(names[k] for k in kept)
+    return Ecg(signal[:, kept] * scale, leads, rate_hz, start_s, patient=patient)
 
 
 def patient_mark(patient: str) -> str:

@@ -12,8 +12,8 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.voltages import is_voltage, unit_name
 
-UNIT_OF_LEAD = re.compile(r"[(\[]\s*([^()\[\]]*?)\s*[)\]]$")
-"""A unit behind a lead's name, as in ``I (uV)``."""
+UNIT_OF_LEAD = re.compile(r"[(\[]\s*([^()\[\]]*?)\s*[)\]]$|[_\s]([munµμ]V)$", re.IGNORECASE)
+"""A unit behind a lead's name, as in ``I (uV)`` or ``I_uV``."""
 
 LEAD = re.compile(r"I{1,3}|aV[RLF]|V\d?R?|MCL?\d?|ML ?I{1,3}|[XYZ]|", re.IGNORECASE)
 """What in its place is no unit but the lead, as in ``lead (II)``."""
@@ -34,9 +34,14 @@ def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
         When the table is no such, or its times are uneven or no seconds.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # As Windows of western countries writes a micro sign.
+        text = content.decode("cp1252", errors="replace")
     lines = text.strip().splitlines()
     names = [name.strip() for name in lines[0].split(",")] if lines else []
     if len(names) < 2 or names[0] != "time_s":
@@ -61,18 +66,18 @@ def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
 
 def _require_millivolts(name: str, path: Path) -> None:
     """Refuse a column whose name says that it holds something else."""
-    unit = UNIT_OF_LEAD.search(name)
-    if unit is None or LEAD.fullmatch(unit[1]) or unit_name(unit[1]) == "mv":
+    found = UNIT_OF_LEAD.search(name)
+    unit = "mV" if found is None else found[1] or found[2] or ""
+    if LEAD.fullmatch(unit) or unit_name(unit) == "mv":
         return
     remedy = (
         "take the column out, for pressures and marks have beats of their own (of a lead that was "
         "not calibrated, write mV: its scale changes no R peak)"
     )
-    if is_voltage(unit[1]):
+    if is_voltage(unit):
         remedy = "write the values so, and (mV) or nothing behind the name"
     raise InputError(
-        f"{path}: lead {name!r} is in {unit[1]}; a CSV file holds the millivolts of an ECG: "
-        f"{remedy}"
+        f"{path}: lead {name!r} is in {unit}; a CSV file holds the millivolts of an ECG: {remedy}"
     )
 
 
@@ -100,7 +105,13 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
     if len(values) == columns and not any(map(math.isinf, values)) and math.isfinite(values[0]):
         return values
     remedy = "mend it, and delete no line: a gap in time is refused"
-    if len(cells) == columns and not all(cell.strip() for cell in cells[1:]):
+    if not any(cell.strip() for cell in cells):
+        remedy = "delete it, and all behind it, if the recording ends there"
+    elif ":" in cells[0]:
+        remedy = "write times as seconds"
+    elif number == 2 and len(cells) == columns and not any(_is_number(cell) for cell in cells):
+        remedy = "delete it if it gives units: times are seconds, values millivolts"
+    elif len(cells) == columns and not all(cell.strip() for cell in cells[1:]):
         remedy = "write nan where a sample is missing"
     elif "." not in line and len(cells) == 2 * columns:
         remedy = "decimal commas look like separators: write points"
@@ -108,6 +119,14 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
         f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
         f"{remedy}"
     )
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.strip().strip('"'))
+    except ValueError:
+        return False
+    return True
 
 
 def _even_step_s(times_s: Float, path: Path) -> float:

@@ -21,6 +21,8 @@ _VALUE_BYTES = {
 }  # fmt: skip
 _HEADER_LINE = re.compile(r"\s*(\w+)\s*[=:](.*)")
 _HEADER_ENDS = "ElementDataFile"
+SPACING = "ElementSpacing"
+"""Field of the header: width and height of a pixel, 1 where it has none."""
 _SEVERAL_FILES = re.compile(r"%|^LIST\b|\s\d+\s+\d+")
 # A file a frame, numbered from, to and by: the library hands the name to C's printf.
 _NUMBERED = re.compile(r"[^%]*%0?\d{0,3}d[^%]*(\s+\d{1,6}){2,3}")
@@ -35,7 +37,7 @@ Fields = dict[str, str]
 
 
 def read_metaimage(path: Path) -> tuple[Any, Fields]:
-    """Pixels ``(n, rows, columns)`` of a sequence, and the header's custom fields.
+    """Pixels ``(n, rows, columns)`` of a sequence, and the header's custom fields and `SPACING`.
 
     Raises
     ------
@@ -61,6 +63,7 @@ def read_metaimage(path: Path) -> tuple[Any, Fields]:
         fields = {key: image.GetMetaData(key).strip() for key in image.GetMetaDataKeys()}
     except (TypeError, UnicodeError) as error:
         raise InputError(f"{path}: a name in its header is no text ({error}); {_COPY}") from error
+    fields[SPACING] = " ".join(f"{size:.9g}" for size in image.GetSpacing()[:2])
     return _grey_frames(path, image, sitk.GetArrayFromImage(image)), fields
 
 
@@ -79,6 +82,12 @@ def _require_all_bytes(path: Path) -> None:
             f"{path}: ElementType is {kind or 'missing'}; it needs one of {', '.join(_VALUE_BYTES)}"
         )
     axes = len(header["DimSize"].split())
+    if header.get("Kinds", "").startswith("vector"):
+        count = header["DimSize"].split()[0]
+        raise InputError(
+            f"{path}: has {count} values a pixel (Kinds begins with vector), as PLUS stores "
+            "colour; record or export grey values, one a pixel"
+        )
     if header.get("NDims", "") != str(axes) or not 2 <= axes <= 4:
         raise InputError(
             f"{path}: NDims is {header.get('NDims', 'missing')} and DimSize has {axes} numbers; a "

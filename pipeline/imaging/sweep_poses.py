@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 
 import numpy as np
 
@@ -50,23 +51,29 @@ def frame_of_poses(frames: Sequence[Fields], asked: str | None) -> str:
     return REFERENCE if followed and not told else TRACKER
 
 
-def rests_at_origin(frames: Sequence[Fields], frame: str) -> bool:
-    """Whether the probe is where the frame of its poses begins, to the last bit, throughout."""
-    return all(_is_identity(fields.get(_name(*_chain(fields, frame)[0]), "")) for fields in frames)
+def always_identity(frames: Sequence[Fields]) -> frozenset[str]:
+    """Names of the transforms that are the identity, to the last bit, in every frame."""
+    names = {name for name in frames[0] if name.endswith("Transform")}
+    return frozenset(
+        name for name in names if all(_is_identity(fields.get(name, "")) for fields in frames)
+    )
 
 
-def is_tracked(fields: Fields, frame: str, with_calibration: bool, at_origin: bool = False) -> bool:
+def is_tracked(
+    fields: Fields, frame: str, with_calibration: bool, resting: AbstractSet[str] = frozenset()
+) -> bool:
     """Whether the picture and all transforms of its pose are valid, that of its pixels included.
 
     A matrix of zeros is no pose: some recorders write it, without a status, for a tool unseen; and
-    others the identity, which is none where the probe does not rest ``at_origin`` throughout.
+    others the identity, which is none but of what is ``resting`` there throughout
+    (`always_identity`).
     """
     chain = [*([("Image", "Probe")] if with_calibration else []), *_chain(fields, frame)]
     names = ["ImageStatus", *(f"{_name(*link)}Status" for link in chain)]
     marked = any(fields.get(name, "OK").upper() != "OK" for name in names)
     blank = any(_is_blank(fields.get(_name(*link), "")) for link in chain)
-    unseen = not at_origin and _is_identity(fields.get(_name(*_chain(fields, frame)[0]), ""))
-    return not (marked or blank or unseen)
+    places = {_name(*link) for link in _chain(fields, frame)} - resting
+    return not (marked or blank or any(_is_identity(fields.get(one, "")) for one in places))
 
 
 def probe_pose(fields: Fields, frame: str, where: str) -> Float:
@@ -115,13 +122,14 @@ def _invertible(probe_from_image: Float) -> Float:
     return whole
 
 
-def reference_pose(fields: Fields) -> Float | None:
-    """4x4 from the patient's reference to the tracker; None where the recording does not tell."""
-    direct = _pose_if_valid(fields, REFERENCE, TRACKER)
+def reference_pose(fields: Fields, resting: AbstractSet[str] = frozenset()) -> Float | None:
+    """4x4 from the patient's reference to the tracker; None where the recording does not tell, as
+    by an identity of what is not ``resting`` there (`always_identity`)."""
+    direct = _pose_if_valid(fields, (REFERENCE, TRACKER), resting)
     if direct is not None:
         return direct
-    tracker_from_probe = _pose_if_valid(fields, "Probe", TRACKER)
-    reference_from_probe = _pose_if_valid(fields, "Probe", REFERENCE)
+    tracker_from_probe = _pose_if_valid(fields, ("Probe", TRACKER), resting)
+    reference_from_probe = _pose_if_valid(fields, ("Probe", REFERENCE), resting)
     if tracker_from_probe is None or reference_from_probe is None:
         return None
     return np.asarray(tracker_from_probe @ np.linalg.inv(reference_from_probe))
@@ -196,11 +204,15 @@ def _matrix(fields: Fields, name: str, where: str) -> Float:
     return matrix
 
 
-def _pose_if_valid(fields: Fields, source: str, target: str) -> Float | None:
-    name = _name(source, target)
+def _pose_if_valid(
+    fields: Fields, link: tuple[str, str], resting: AbstractSet[str]
+) -> Float | None:
+    name = _name(*link)
     matrix = _numbers(fields.get(name, ""))
     valid = fields.get(f"{name}Status", "OK").upper() == "OK"
-    return matrix if valid and matrix is not None and np.linalg.det(matrix) > 0.5 else None
+    seen = name in resting or not _is_identity(fields.get(name, ""))
+    sound = matrix is not None and np.linalg.det(matrix) > 0.5
+    return matrix if valid and seen and sound else None
 
 
 def _numbers(text: str) -> Float | None:

@@ -12,17 +12,17 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer, Mask
-from pipeline.imaging.metaimage import Fields, read_metaimage
+from pipeline.imaging.metaimage import SPACING, Fields, read_metaimage
 from pipeline.imaging.stuck import without_stuck
 from pipeline.imaging.sweep_poses import (
     TRACKER,
+    always_identity,
     frame_of_poses,
     image_calibration,
     is_tracked,
     probe_pose,
     reference_pose,
     require_resting,
-    rests_at_origin,
 )
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ _STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
 # Logarithm of width over height of a pixel that is told of: calibrations are off by some per cent,
 # pixels of television are 7 % wider or 9 % narrower than high.
 _UNSQUARE = 0.03
+# A pixel's size by file and by calibration is the same, or 1 mm, within this.
+_SAME_SIZE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +140,8 @@ def read_sweep(
     frames = _frame_fields(path, header, len(images))
     frame = frame_of_poses(frames, pose_frame)
     own = probe_from_image is None
-    at_origin = rests_at_origin(frames, frame)
-    valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own, at_origin)]
+    resting = always_identity(frames)
+    valid = [k for k, fields in enumerate(frames) if is_tracked(fields, frame, own, resting)]
     if not valid:
         raise InputError(
             f"{path}: none of its {len(frames)} frames has status OK; the probe was out of the "
@@ -150,7 +152,8 @@ def read_sweep(
     places = [(frames[k], f"{path}, frame {k}") for k in valid]
     tracker_from_probe = np.stack([probe_pose(one, frame, where) for one, where in places])
     calibrated = [image_calibration(one, probe_from_image, where) for one, where in places]
-    seen = (reference_pose(one) for one, _ in places)
+    spaced = _told_of_spacing(path, header, calibrated[0])
+    seen = (reference_pose(one, resting) for one, _ in places)
     sweep = Sweep(
         path.stem,
         np.asarray(images[valid], dtype=np.float32),
@@ -160,9 +163,39 @@ def read_sweep(
         np.array(valid),
         frame,
         tuple(pose for pose in seen if pose is not None),
-        (*turned, *_told_of_pixels(calibrated), *_left_out(len(frames) - len(valid), len(frames))),
+        (
+            *turned,
+            *spaced,
+            *_told_of_pixels(calibrated),
+            *_left_out(len(frames) - len(valid), len(frames)),
+        ),
     )
     return without_stuck(sweep)
+
+
+def _told_of_spacing(path: Path, header: Fields, calibration: Float) -> list[str]:
+    """A sentence where the file gives its pixels a size: by PLUS a calibration holds it already.
+
+    Raises
+    ------
+    InputError
+        When the calibration holds none, so that by 3D Slicer, which scales by the file's first,
+        both go together.
+    """
+    told = np.array([float(word) for word in header[SPACING].split()])
+    held = np.linalg.norm(calibration[:3, :2], axis=0)
+    if np.allclose(told, 1, rtol=0, atol=_SAME_SIZE):
+        return []
+    size = " by ".join(f"{one:g}" for one in told)
+    if np.allclose(held, 1, rtol=0, atol=_SAME_SIZE):
+        raise InputError(
+            f"{path}: {SPACING} makes pixels of {size} mm and ImageToProbe takes each for 1 mm: "
+            "multiply the first two columns of ImageToProbe by them (or give the product as "
+            "us.probe_from_image in study.yaml): it is to lead from pixels, as PLUS has it"
+        )
+    return [
+        f"{SPACING} of {size} mm is not looked at: ImageToProbe leads from pixels, as PLUS has it"
+    ]
 
 
 def _told_of_pixels(calibrated: Sequence[Float]) -> list[str]:
@@ -228,7 +261,8 @@ def _as_scanned(path: Path, images: Any, header: Fields) -> tuple[Any, tuple[str
     ImageToProbe belongs to pictures in this order, to which PLUS turns others when it reads them.
     """
     kind = header.get("UltrasoundImageType", "").upper()
-    if kind not in ("", "BRIGHTNESS", "UNKNOWN", "XX"):
+    # Of colours only those are read that are all grey.
+    if kind not in ("", "BRIGHTNESS", "RGB_COLOR", "UNKNOWN", "XX"):
         raise InputError(
             f"{path}: UltrasoundImageType is {kind}; it needs the brightness that a scanner shows "
             "(BRIGHTNESS): record, or convert it to, B-mode pictures"
