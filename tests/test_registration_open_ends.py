@@ -1,4 +1,4 @@
-"""Stacks that end inside a chamber: what lies beyond is neither blood nor tissue to the model."""
+"""Stacks that end inside a chamber, or below one: what lies beyond is neither blood nor tissue."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scipy.optimize import lsq_linear
 from pipeline.geometry import MovingSurface, transform_points
 from pipeline.imaging.cine import Cine
 from pipeline.registration.frames import sample_frames
-from pipeline.registration.open_ends import CHAMBERS, open_ends
+from pipeline.registration.open_ends import CHAMBERS, open_ends, open_lids
 from pipeline.registration.pose_search import climb, pivot_of
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
@@ -49,6 +49,17 @@ def cut(surfaces, last_mm=LAST_MM):
         return MovingSurface(vertices_mm, moving.triangles, moving.phases)
 
     return {name: flat(one) for name, one in surfaces.items()}
+
+
+def ventricles(surfaces, last_mm=26.0):
+    """Without atria and aorta, as of a stack that ends at the valves; a wall of 10 mm."""
+    inner = surfaces["lv_endocardium"]
+    middle_mm = inner.vertices_mm.mean(axis=1, keepdims=True)
+    away_mm = inner.vertices_mm - middle_mm
+    thick = 1 + 10 / np.linalg.norm(away_mm, axis=-1, keepdims=True)
+    outer = MovingSurface(middle_mm + thick * away_mm, inner.triangles, inner.phases)
+    right = surfaces["rv_endocardium"]
+    return cut({"lv_endocardium": inner, "rv_endocardium": right, "epicardium": outer}, last_mm)
 
 
 def stack(last_mm=LAST_MM, upside_down=False):
@@ -192,3 +203,64 @@ def test_a_result_by_a_stack_that_ends_in_chambers_is_less_sure_and_says_so(whol
     assert told.expected_mm > 1.1 * blind.expected_mm
     assert "images end inside left_atrium, right_atrium" in told.reason
     assert "images end" not in blind.reason
+
+
+def test_a_ventricle_without_its_atrium_is_open_above_its_lid(whole):
+    surfaces = ventricles(whole)
+    left, right = open_lids(surfaces)
+    assert [left.atrium, right.atrium] == ["left_atrium", "right_atrium"]
+    assert left.outwards @ TILT[:, 2] > 0.999
+    drawn = draw_tissue(surfaces, 2.5)
+    z, y, x = np.meshgrid(*(np.arange(n) for n in drawn.grid.shape), indexing="ij")
+    local = (np.stack([x, y, z], axis=-1) * 2.5 + drawn.grid.origin_mm - CENTRE_MM) @ TILT
+    blood, wall, carried = (drawn.share[0, ..., part] for part in range(3))
+    # The lid lies 30 mm above the middle, where the cavity's radius is 24 sqrt(1 - (30 / 42)^2).
+    above_mm = local[..., 2] - 30
+    axis = np.hypot(local[..., 0], local[..., 1]) < 24 * np.sqrt(1 - (30 / 42) ** 2) - 4
+    np.testing.assert_allclose(carried[axis & (above_mm > 2.5) & (above_mm < 9)], 1, atol=0.01)
+    assert carried[axis & (above_mm > 27)].max() < 1e-6
+    assert carried[above_mm < -8].max() < 1e-6
+    assert wall[axis & (np.abs(above_mm) < 6)].max() < 0.1
+    beside = (np.abs(local[..., 2]) < 20) & (blood > 0.3) & (blood < 0.7)
+    assert wall[beside].min() > 0.5
+
+
+@pytest.mark.parametrize("given", ["left_atrium", "right_atrium"])
+def test_a_ventricle_with_its_atrium_is_not_open(whole, given):
+    (lid,) = open_lids(ventricles(whole) | {given: whole[given]})
+    assert lid.atrium == {"left_atrium": "right_atrium", "right_atrium": "left_atrium"}[given]
+
+
+def test_a_ventricle_that_the_stack_cuts_is_open_at_the_end_of_the_stack_alone(whole):
+    surfaces = ventricles(whole)
+    ends = open_ends(surfaces, stack(last_mm=20.0))
+    assert [end.chambers for end in ends] == [("lv_endocardium", "rv_endocardium")]
+    assert open_lids(surfaces, ends) == []
+
+
+def test_without_a_lid_at_the_valves_nothing_is_open(whole):
+    """A whole ellipsoid within another tells no way; nor does a cavity without muscle."""
+    surfaces = ventricles(whole, last_mm=110.0)
+    assert open_lids(surfaces) == []
+    del surfaces["epicardium"]
+    assert draw_tissue(surfaces, 2.5).share.shape[-1] == 2
+
+
+def test_atria_that_a_model_lacks_do_not_draw_the_pose_along(whole):
+    """Beside what the whole model finds; blind without the muscle that tells where the lid is."""
+    surfaces = ventricles(whole, last_mm=14.0)
+    blood = {name: one for name, one in surfaces.items() if name != "epicardium"}
+    beside_mm = []
+    for seed in (4, 5):
+        made = record(seed, frames=30)
+
+        def found_mm(model, made=made):
+            search = prepare_search(made.phases, model, made.mr_from_tracker, GREY)
+            pose = climb(search.fine_level(made.sweeps), made.mr_from_tracker, search.pivot)
+            return transform_points(pose @ np.linalg.inv(made.mr_from_tracker), CENTRE_MM)
+
+        best = height_mm(found_mm(whole))
+        beside_mm.append([abs(height_mm(found_mm(one)) - best) for one in (blood, surfaces)])
+    blind_mm, told_mm = np.mean(beside_mm, axis=0)
+    assert told_mm < 0.4 * blind_mm
+    assert blind_mm > 0.5

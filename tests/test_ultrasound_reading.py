@@ -340,5 +340,5 @@ def test_colour_frames_are_refused(tmp_path):
     # As PLUS stores it.
     kinds = b"Kinds = vector domain domain list\nDimSize = 3 17 12 5"
     grey.write_bytes(grey.read_bytes().replace(b"DimSize = 17 12 5", kinds))
-    with pytest.raises(InputError, match="has 3 values a pixel .Kinds begins with vector"):
+    with pytest.raises(InputError, match=r"has 3 values a pixel \(Kinds begins with vector\)"):
         read_sweep(grey)

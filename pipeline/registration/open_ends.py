@@ -1,24 +1,30 @@
-"""Where the slices of a cine end inside a chamber: what lies beyond is open, not empty.
+"""Where chambers go on beyond what the model knows: what lies there is open, not empty.
 
 Most stacks end in the atria, and the surfaces found in them end there, too, with a lid. Ultrasound
 shows the atria whole. Held against a model that ends at the lid, it draws the pose towards the
 apex. So what the outermost slice shows of blood is carried on along the normal for a way, apart
-from the blood that was seen: each frame tells by itself how much of it there is.
+from the blood that was seen: each frame tells by itself how much of it there is. So it is above
+the lid of a ventricle whose atrium has no surface, though the stack goes on there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from pipeline.geometry import Float, Float32, Grid, Mask, MovingSurface, area_vectors
+from pipeline.geometry import Float, Float32, Grid, Mask, MovingSurface, Surface, area_vectors
 from pipeline.imaging.cine import Cine
+from pipeline.surface.measures import LID_FACING, base_direction
+from pipeline.surface.mesh import vertex_normals
 
 CHAMBERS = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium")
 """What a stack should hold whole; the aorta leaves every one."""
+
+BELOW = {"left_atrium": "lv_endocardium", "right_atrium": "rv_endocardium"}
+"""The ventricle that each atrium fills."""
 
 LEAST_CUT_MM2 = 300.0
 """A chamber of which the outermost slice cuts more than this, on average over the beat, goes on
@@ -90,6 +96,51 @@ class OpenEnd:
         inside = places[outside] - back_mm / np.array(grid.spacing_mm)
         fading = np.clip((_CARRIED_MM - height_mm[outside]) / _FADING_MM, 0, 1)
         return Beyond(outside, inside[:, ::-1].T, fading)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenLid:
+    """The end of a ventricle that its atrium, which has no surface, stands on."""
+
+    atrium: str
+    ventricle: str
+    outwards: Float
+    """``(3,)`` unit vector from apex to base."""
+
+    lifted: Mask
+    """``(vertex,)`` of the ventricle: those of its basal half that look outwards."""
+
+    def carried_to(self, surface: Surface) -> list[Surface]:
+        """The ventricle carried on through its lid, for ways that end one after the other."""
+        ways_mm = np.arange(_CARRIED_MM - _FADING_MM, _CARRIED_MM + 1, _FADING_MM / 2)
+        push = self.lifted[:, None] * self.outwards
+        return [Surface(surface.vertices_mm + way * push, surface.triangles) for way in ways_mm]
+
+    def reached(self, points_mm: Float) -> Float:
+        """``(n, 3)`` how far the ventricle's ``(phase, n, 3)`` vertices are carried, LPS mm."""
+        return (points_mm[:, self.lifted] + _CARRIED_MM * self.outwards).reshape(-1, 3)
+
+
+def open_lids(surfaces: Mapping[str, MovingSurface], ends: Sequence[OpenEnd] = ()) -> list[OpenLid]:
+    """The ventricles whose atria have no surface, but for those that the stack's ``ends`` cut.
+
+    None where the left one's lid at the valve plane cannot be told: it gives the direction.
+    """
+    cut = {name for end in ends for name in end.chambers}
+    if not {"lv_endocardium", "epicardium"} <= surfaces.keys():
+        return []
+    outwards = base_direction(surfaces["lv_endocardium"].at(0), surfaces["epicardium"].at(0))
+    if outwards is None:
+        return []
+    found = []
+    for atrium, name in BELOW.items():
+        if atrium not in surfaces and name in surfaces and name not in cut:
+            first = surfaces[name].at(0)
+            height = first.vertices_mm @ outwards
+            looks = vertex_normals(first.vertices_mm, first.triangles) @ outwards > LID_FACING
+            lifted = looks & (height > (height.min() + height.max()) / 2)
+            found.append(OpenLid(atrium, name, outwards, lifted))
+    return found
 
 
 def open_ends(surfaces: Mapping[str, MovingSurface], cine: Cine) -> list[OpenEnd]:

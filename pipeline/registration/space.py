@@ -24,7 +24,7 @@ from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
 from pipeline.registration.misplaced import by_chance
-from pipeline.registration.open_ends import open_ends
+from pipeline.registration.open_ends import open_ends, open_lids
 from pipeline.registration.parts import gain_apart
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.reading import as_compared
@@ -223,6 +223,7 @@ def find(
     require_frames(sweeps, phases, settings)
     lacking = [name for name in BLOOD if name not in surfaces]
     ends = [] if cine is None else open_ends(surfaces, cine)
+    open_above = [lid.atrium for lid in open_lids(surfaces, ends)]
     cut = sorted({name for end in ends for name in end.chambers}, key=BLOOD.index)
     if lacking or cut:
         further = _LACKING * len(lacking) + _CUT * len(cut)
@@ -258,7 +259,9 @@ def find(
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
     if lacking and result.reason:
-        said = f"the model lacks {', '.join(lacking)}, whose blood it takes for tissue"
+        said = f"the model lacks {', '.join(lacking)}"
+        if not set(lacking) <= set(open_above):
+            said += ", whose blood it takes for tissue"
         result = replace(result, reason=f"{result.reason}; {said}")
     if cut and result.reason:
         said = f"the images end inside {', '.join(cut)}: what lies beyond is not known"

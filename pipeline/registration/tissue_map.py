@@ -23,7 +23,7 @@ from pipeline.field.winding import crossing
 from pipeline.geometry import Float, Float32, Grid, MovingSurface, Surface
 from pipeline.imaging.cine import Cine
 from pipeline.registration.cavity_muscle import VENTRICLES, CineOnGrid
-from pipeline.registration.open_ends import OpenEnd, open_ends
+from pipeline.registration.open_ends import OpenEnd, OpenLid, open_ends, open_lids
 
 BLOOD = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium", "aorta")
 """The structures that hold blood."""
@@ -71,7 +71,8 @@ def draw_tissue(
     ----------
     cine
         What the surfaces were found in: where its slices end inside a chamber, what lies beyond is
-        open (`pipeline.registration.open_ends`). None: chambers end where their surfaces do.
+        open (`pipeline.registration.open_ends`). None: chambers end where their surfaces do, but
+        for ventricles whose atria have no surface.
     muscle
         Whether what the cine shows of muscle inside the ventricles is no blood
         (`pipeline.registration.cavity_muscle`). Without a cine, or an epicardium to tell the grey
@@ -86,9 +87,11 @@ def draw_tissue(
     phases = cavities[0].phases
     names = [name for name in BLOOD if name in surfaces]
     ends = [] if cine is None else open_ends(surfaces, cine)
-    grid = _grid_around(cavities, spacing_mm, ends)
+    lids = open_lids(surfaces, ends)
+    reached_mm = [lid.reached(surfaces[lid.ventricle].vertices_mm) for lid in lids]
+    grid = _grid_around(cavities, spacing_mm, ends, reached_mm)
     beyond = [end.over(grid) for end in ends]
-    share = np.empty((len(phases), *grid.shape, 3 if beyond else 2), dtype=np.float32)
+    share = np.empty((len(phases), *grid.shape, 3 if beyond or lids else 2), dtype=np.float32)
     seen = CineOnGrid.of(cine, phases, grid) if cine is not None and muscle else None
     grey = None if seen is None else _grey_of_muscle(seen, surfaces, names, grid)
 
@@ -101,14 +104,28 @@ def draw_tissue(
         carried = np.zeros_like(blood)
         for end in beyond:
             carried = np.maximum(carried, end.carried(blood))
-        soft = gaussian_filter(np.maximum(blood, carried), _WALL_MM / spacing_mm, mode="constant")
+        width = _WALL_MM / spacing_mm
+        soft = gaussian_filter(np.maximum(blood, carried), width, mode="constant")
         wall = 4 * soft * (1 - soft)
+        if lids:
+            above = [_above(lid, surfaces[lid.ventricle].at(index), grid) for lid in lids]
+            over = np.maximum(np.max(above, axis=0) - blood, 0)
+            # A wall parts blood from tissue, a lid from what is open.
+            tissue = 1 - soft - gaussian_filter(over, width, mode="constant")
+            wall = 4 * soft * np.maximum(tissue, 0)
+            carried = np.maximum(carried, over)
         for end in beyond:
             blood, wall = np.where(end.outside, 0, blood), np.where(end.outside, 0, wall)
         share[index] = np.stack([blood, wall, carried][: share.shape[-1]], axis=-1)
 
     _in_turn(draw, len(phases))
     return TissueMap(share, phases, grid)
+
+
+def _above(lid: OpenLid, ventricle: Surface, grid: Grid) -> Float32:
+    """``(z, y, x)`` share of what a ventricle is carried on to through its lid, itself as well."""
+    every = [coverage(one, grid) for one in lid.carried_to(ventricle)]
+    return np.asarray(np.mean(every, axis=0), np.float32)
 
 
 def _in_turn(work: Callable[[int], None], phases: int) -> None:
@@ -231,10 +248,13 @@ def coverage(surface: Surface, grid: Grid) -> Float32:
 
 
 def _grid_around(
-    surfaces: Sequence[MovingSurface], spacing_mm: float, ends: Sequence[OpenEnd]
+    surfaces: Sequence[MovingSurface],
+    spacing_mm: float,
+    ends: Sequence[OpenEnd],
+    reached_mm: Sequence[Float],
 ) -> Grid:
     points_mm = np.concatenate([one.vertices_mm.reshape(-1, 3) for one in surfaces])
-    points_mm = np.concatenate([points_mm, *(one.reached(points_mm) for one in ends)])
+    points_mm = np.concatenate([points_mm, *(one.reached(points_mm) for one in ends), *reached_mm])
     lower, upper = points_mm.min(axis=0) - _MARGIN_MM, points_mm.max(axis=0) + _MARGIN_MM
     x, y, z = (int(count) for count in np.ceil((upper - lower) / spacing_mm) + 1)
     origin_mm = (float(lower[0]), float(lower[1]), float(lower[2]))
