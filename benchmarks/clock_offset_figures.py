@@ -1,14 +1,16 @@
 """How truly the offset between the clocks of ultrasound and ECG is found, over unseen studies.
 
     python benchmarks/clock_offset_figures.py OUT [--studies 14] [--seed 4101] [--sweeps 2]
-        [--frames 40] [--surfaces truth|PRODUCTS]
+        [--frames 40] [--surfaces truth|PRODUCTS] [--last-late-ms 0]
 
 Studies differ in anatomy, illness and probe; every sweep turns its fan, is held by a hand that
 moves, and has its scanner's own noise, shadows, and the tracker's, the calibration's and the time
 stamps' errors. The stamps are put off by up to 200 ms either way, the start by 10 mm and 10
 degrees. The pose is sought at the wrong phases, as `register` does, then the offset is estimated.
 ``--surfaces`` names a folder of products, one a patient named ``<seed>-<pathology>``, to compare
-with what the pipeline found in the cine rather than with the phantom's own meshes. Results are kept
+with what the pipeline found in the cine rather than with the phantom's own meshes.
+``--last-late-ms`` puts the stamps of the last sweep alone so much further off: how far apart the
+sweeps' clocks are told to be is written, too. Results are kept
 line by line in OUT/results.jsonl; what is there is not done again.
 """
 
@@ -40,7 +42,7 @@ from data_synth.simulate import (
 from data_synth.ultrasound import Sweep, simulate_sweeps
 from pipeline.geometry import Float, MovingSurface, transform_points
 from pipeline.products import read_table
-from pipeline.registration.clock_offset import Timing, estimate_offset
+from pipeline.registration.clock_offset import Timing, clocks_apart, estimate_offset
 from pipeline.registration.frames import DisplacedSweep
 from pipeline.registration.reading import as_compared
 from pipeline.registration.search import prepare_search
@@ -70,7 +72,7 @@ def studies(arguments: argparse.Namespace) -> Iterator[PhantomSettings]:
         )
 
 
-def measured(settings: PhantomSettings, surfaces: str) -> dict[str, Any]:
+def measured(settings: PhantomSettings, surfaces: str, late_ms: float) -> dict[str, Any]:
     """One study: true and found offset, standard deviation, errors of the pose, seconds."""
     heart = load_heart(settings)
     asked = settings.ultrasound
@@ -81,7 +83,9 @@ def measured(settings: PhantomSettings, surfaces: str) -> dict[str, Any]:
     rng = np.random.default_rng([settings.seed, 77])
     ahead_s = float(rng.uniform(-LARGEST_S, LARGEST_S))
     r_times_s = detect_r_peaks(ecg.signal_mv, ecg.sampling_rate_hz)
-    timing = Timing([one.times_s + ahead_s for one in recorded], r_times_s, cycle_rr_s)
+    times_s = [one.times_s + ahead_s for one in recorded]
+    times_s[-1] = times_s[-1] + late_ms / 1e3
+    timing = Timing(times_s, r_times_s, cycle_rr_s)
     truth = recorded[0].mr_from_tracker
     start = first_guess(stream(settings, START), truth, heart.centre_mm)
     begun_s = time.process_time()
@@ -92,6 +96,7 @@ def measured(settings: PhantomSettings, surfaces: str) -> dict[str, Any]:
     searched_s = time.process_time()
     level = search.fine_level(sweeps).thinned(options.max_frames)
     found = estimate_offset(level, best.pose, search.pivot, timing)
+    apart = clocks_apart(level, found.mr_from_tracker, search.pivot, timing)
     targets_mm = heart.surfaces(0.0)["heart"][0]
     return {
         "study": f"{settings.seed}-{settings.pathology}-{asked.probe}",
@@ -99,6 +104,7 @@ def measured(settings: PhantomSettings, surfaces: str) -> dict[str, Any]:
         "true_ms": 1e3 * ahead_s,
         "found_ms": None if found.offset_s is None else 1e3 * found.offset_s,
         "sd_ms": None if found.offset_s is None else 1e3 * found.sd_s,
+        "apart_ms": 0.0 if apart is None else 1e3 * apart.by_s,
         "before_mm": _error_mm(best.pose, truth, targets_mm),
         "after_mm": _error_mm(found.mr_from_tracker, truth, targets_mm),
         "search_s": searched_s - begun_s,
@@ -142,6 +148,15 @@ def summary(rows: list[dict[str, Any]]) -> str:
     )
 
 
+def between_sweeps(rows: list[dict[str, Any]], late_ms: float) -> str:
+    """How many were told that their sweeps have clocks of their own, and how truly."""
+    told_ms = np.array([row["apart_ms"] for row in rows if row["apart_ms"]])
+    text = f"{len(told_ms)} of {len(rows)} studies told of sweeps whose clocks are apart"
+    if len(told_ms):
+        text += f", by up to {np.abs(told_ms - late_ms).max():.1f} ms other than {late_ms:g} ms"
+    return text
+
+
 def main() -> None:
     """Print a line a study, and the figures over all."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -151,9 +166,10 @@ def main() -> None:
     parser.add_argument("--sweeps", type=int, default=2)
     parser.add_argument("--frames", type=int, default=40, help="of each sweep")
     parser.add_argument("--surfaces", default="truth")
+    parser.add_argument("--last-late-ms", type=float, default=0.0, help="of the last sweep alone")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    decisive = ("sweeps", "frames", "surfaces")
+    decisive = ("sweeps", "frames", "surfaces", "last_late_ms")
     require_same(arguments.out, {name: getattr(arguments, name) for name in decisive})
     kept = arguments.out / "results.jsonl"
     rows = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
@@ -161,11 +177,13 @@ def main() -> None:
     for settings in studies(arguments):
         if f"{settings.seed}-{settings.pathology}-{settings.ultrasound.probe}" in done:
             continue
-        rows.append(measured(settings, arguments.surfaces))
+        rows.append(measured(settings, arguments.surfaces, arguments.last_late_ms))
         with kept.open("a") as file:
             file.write(json.dumps(rows[-1]) + "\n")
         print(json.dumps(rows[-1]), flush=True)
-    print(summary(rows))
+    print(between_sweeps(rows, abs(arguments.last_late_ms)))
+    if not arguments.last_late_ms:
+        print(summary(rows))
 
 
 if __name__ == "__main__":

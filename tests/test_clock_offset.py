@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,12 @@ from ellipsoid_heart import moving_surfaces, record, start_off
 
 from pipeline.errors import InputError
 from pipeline.registration.clock_offset import (
+    MODEL_SD_S,
     ClockOffset,
+    ClocksApart,
     Timing,
     _Profile,
+    clocks_apart,
     estimate_offset,
     settle_clock,
 )
@@ -214,7 +218,7 @@ def test_an_offset_counts_from_three_standard_deviations_on():
 def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, surfaces, sd_s, known):
     """The model's own 5 ms counted in."""
     monkeypatch.setattr(_Profile, "nearest", lambda self, pose, offset_s: (0.1, pose))
-    monkeypatch.setattr(_Profile, "summit", lambda self, pose, offset_s: (0.1, sd_s))
+    monkeypatch.setattr(_Profile, "summit", lambda self, poses, offset_s: (0.1, sd_s))
     monkeypatch.setattr(_Profile, "climb", lambda self, pose, offset_s: pose)
     found = estimated(recording, surfaces, stamped(recording))
     assert (found.offset_s is not None) == known
@@ -262,4 +266,56 @@ def scanned(rr_s, profile, true_s):
             return Score(2 * np.pi * (offset_s - true_s) / rr_s)
 
     timing = Timing([np.zeros(1)], np.arange(10) * rr_s, rr_s)
-    return Drawn(None, None, timing)._scan(np.eye(4))
+    return Drawn(None, None, timing).scan(np.eye(4))
+
+
+@pytest.fixture(scope="module")
+def long_recording():
+    """Each sweep has frames enough to speak for itself."""
+    return record(seed=2, frames=24)
+
+
+def later_by(timing, late_s):
+    """The second sweep's stamps alone, ahead by so much."""
+    return replace(timing, times_s=[timing.times_s[0], timing.times_s[1] + late_s])
+
+
+@pytest.mark.parametrize("late_s", [-0.3, 0.0, 0.03, 0.12, 0.35])
+def test_sweeps_on_two_clocks_are_told_apart(long_recording, surfaces, late_s):
+    """At the pose that fits best by the stamps as they are, right or wrong."""
+    timing = later_by(stamped(long_recording), late_s)
+    start = long_recording.mr_from_tracker
+    search = prepare_search(timing.phases(), surfaces, start, SETTINGS)
+    level = search.fine_level(long_recording.sweeps)
+    found = clocks_apart(level, climb(level, start, search.pivot), search.pivot, timing)
+    if abs(late_s) < 0.05:
+        assert found is None
+        return
+    assert found is not None
+    assert (found.ahead, found.behind) == ((2, 1) if late_s > 0 else (1, 2))
+    # Three standard deviations of what all frames of a sweep share, for two sweeps.
+    assert abs(found.by_s - abs(late_s)) < 3 * np.sqrt(2) * MODEL_SD_S
+
+
+def test_clocks_that_are_apart_make_a_result_doubtful(long_recording, surfaces):
+    timing = later_by(stamped(long_recording), 0.2)
+    given = long_recording.sweeps, timing.phases(), surfaces, long_recording.mr_from_tracker
+    found = find(*given, QUICK, timing=timing)
+    assert found.verdict != "good"
+    assert re.search(r"stamps of sweep 2 are 0\.(19|20|21) s ahead of .* sweep 1", found.reason)
+
+
+def test_clocks_far_apart_are_compared_round_the_beat(monkeypatch):
+    """Offsets of nearly half a beat ahead and behind lie side by side."""
+    samples = type("Samples", (), {"sweep": lambda _, sizes: np.repeat([0, 1, 2], sizes)})()
+    level = type("Level", (), {"samples": samples, "only": lambda _, frames: frames[0]})()
+    own = {0: (0.38, 0.005), 24: (-0.39, 0.005), 48: (-0.30, 0.005)}
+    monkeypatch.setattr(
+        "pipeline.registration.clock_offset._own_offset", lambda first, *_: own[int(first)]
+    )
+    timing = Timing([np.arange(24.0)] * 3, R_TIMES_S, RR_S)
+    found = clocks_apart(level, np.eye(4), None, timing)
+    # The third is 0.12 s ahead of the first, the second 0.03.
+    assert found == ClocksApart(3, 1, pytest.approx(0.12))
+    own[48] = (-0.38, 0.005)
+    assert clocks_apart(level, np.eye(4), None, timing) is None

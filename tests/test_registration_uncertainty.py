@@ -260,7 +260,9 @@ class TestVerdict:
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": 0.0, "misplaced": ""}
         in_view = np.ones(40)
         level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
-        found = SimpleNamespace(everything=level, bears_out=borne_out, pose=None, **sure)
+        found = SimpleNamespace(
+            everything=level, bears_out=borne_out, pose=None, clocks=None, **sure
+        )
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)
         assert verdict.grade == "doubtful"

@@ -35,6 +35,8 @@ MODEL_SD_S = 0.005
 surfaces' motion is smoothed over more than that. No spread between frames shows it."""
 SIGNIFICANT = 3.0
 """An offset of fewer standard deviations than this may be none."""
+LEAST_APART_S = 0.050
+"""Clocks of sweeps that are nearer than this are one."""
 # Trial offsets: fine enough not to step over a summit, which is some 100 ms wide.
 _SCAN_S = 0.020
 # Half the profile's width by which it is followed to its summit: more than half the time between
@@ -193,7 +195,8 @@ def estimate_offset(
         return unknown
     offset_s, best = near
     for _ in range(_ROUNDS):
-        summit = profile.summit(best, offset_s)
+        poses = [profile.climb(best, one) for one in around(offset_s)]
+        summit = profile.summit(poses, offset_s)
         if summit is None:
             return unknown
         before_s, (offset_s, sd_s) = offset_s, summit
@@ -202,6 +205,73 @@ def estimate_offset(
             break
     sd_s = float(np.hypot(sd_s, MODEL_SD_S))
     return ClockOffset(offset_s, sd_s, best) if sd_s <= LARGEST_SD_S else unknown
+
+
+@dataclass(frozen=True, slots=True)
+class ClocksApart:
+    """Two sweeps, counted from 1, that were not stamped by one clock."""
+
+    ahead: int
+    behind: int
+    by_s: float
+
+
+def clocks_apart(
+    level: Level, pose: Float, pivot: Pivot, timing: Timing | None
+) -> ClocksApart | None:
+    """The sweeps whose clocks are furthest apart by the motion in each one's own frames.
+
+    Parameters
+    ----------
+    level
+        The frames, at any phases, and the model.
+    pose
+        4x4 ``mr_from_tracker`` of all frames, at which every sweep is looked at: frames at wrong
+        phases fit the better the nearer they come to right ones, whatever the pose is drawn by.
+    timing
+        None: nothing is known.
+
+    Returns
+    -------
+    None where fewer than two sweeps tell, and where no two are apart beyond doubt.
+    """
+    if timing is None or timing.doubts():
+        return None
+    sweep = level.samples.sweep([len(times_s) for times_s in timing.times_s])
+    told: dict[int, tuple[float, float]] = {}
+    for number in np.unique(sweep).tolist():
+        own = level.only(np.flatnonzero(sweep == number))
+        found = _own_offset(own, pose, pivot, timing)
+        if found is not None:
+            told[number + 1] = found
+    if len(told) < 2:
+        return None
+    beat_s, (first_s, _) = median_rr_s(timing.r_times_s), next(iter(told.values()))
+    off_s = {number: math.remainder(own_s - first_s, beat_s) for number, (own_s, _) in told.items()}
+    ahead, behind = max(off_s, key=off_s.__getitem__), min(off_s, key=off_s.__getitem__)
+    by_s = off_s[ahead] - off_s[behind]
+    beyond_s = SIGNIFICANT * math.hypot(told[ahead][1], told[behind][1])
+    return ClocksApart(ahead, behind, by_s) if by_s > max(LEAST_APART_S, beyond_s) else None
+
+
+def _own_offset(
+    level: Level, pose: Float, pivot: Pivot, timing: Timing
+) -> tuple[float, float] | None:
+    """Offset and its standard deviation by one sweep's frames at a given pose."""
+    if level.samples.frames < LEAST_FRAMES:
+        return None
+    profile = _Profile(level, pivot, timing)
+    offset_s, rival = profile.scan(pose)
+    summit = profile.summit([pose] * 3, offset_s)
+    if summit is None or rival > _EQUAL_RIVAL:
+        return None
+    offset_s, sd_s = summit[0], math.hypot(summit[1], MODEL_SD_S)
+    return (offset_s, sd_s) if sd_s <= LARGEST_SD_S else None
+
+
+def around(offset_s: float) -> tuple[float, float, float]:
+    """The offsets from which a profile's slope and bending are taken."""
+    return offset_s - _PROFILE_S, offset_s, offset_s + _PROFILE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,13 +295,13 @@ class _Profile:
     def nearest(self, pose: Float, offset_s: float) -> tuple[float, Float] | None:
         """The best of a row of offsets, and the pose there; None where two fit alike."""
         for _ in range(_ROUNDS):
-            here_s, rival = self._scan(pose)
+            here_s, rival = self.scan(pose)
             if abs(here_s - offset_s) <= _SCAN_S / 2:
                 break
             offset_s, pose = here_s, self.climb(pose, here_s)
         return (offset_s, pose) if rival <= _EQUAL_RIVAL else None
 
-    def _scan(self, pose: Float) -> tuple[float, float]:
+    def scan(self, pose: Float) -> tuple[float, float]:
         """The best offset within half a beat to either side, at one pose; and the share of its
         score that an offset elsewhere reaches."""
         beat_s = median_rr_s(self.timing.r_times_s)
@@ -245,11 +315,12 @@ class _Profile:
         far = peak & (np.minimum(apart_s, beat_s - apart_s) > _ELSEWHERE_S)
         return float(offsets_s[top]), float((scores[far] / scores[top]).max(initial=0.0))
 
-    def summit(self, pose: Float, offset_s: float) -> tuple[float, float] | None:
+    def summit(self, poses: Sequence[Float], offset_s: float) -> tuple[float, float] | None:
         """Where the profile peaks near an offset, and the standard deviation of that place by the
-        frames' slopes; None where it does not bend down."""
-        offsets_s = (offset_s - _PROFILE_S, offset_s, offset_s + _PROFILE_S)
-        before, here, after = (self.at(one).losses(self.climb(pose, one)) for one in offsets_s)
+        frames' slopes, by the poses `around` it; None where it does not bend down."""
+        before, here, after = (
+            self.at(one).losses(pose) for pose, one in zip(poses, around(offset_s), strict=True)
+        )
         slopes = (after - before) / (2 * _PROFILE_S)
         bending = (before + after - 2 * here).sum() / _PROFILE_S**2
         if bending <= 0:

@@ -19,7 +19,13 @@ from pipeline.imaging.cine import Cine
 from pipeline.progress import Progress
 from pipeline.registration.breathing import follow_breath
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
-from pipeline.registration.clock_offset import ClockOffset, Timing, settle_clock
+from pipeline.registration.clock_offset import (
+    ClockOffset,
+    ClocksApart,
+    Timing,
+    clocks_apart,
+    settle_clock,
+)
 from pipeline.registration.correction import Correction
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
@@ -144,6 +150,7 @@ class _Found:
 
     size: Size
     apart: float
+    clocks: ClocksApart | None
     misplaced: str
     """See `Evidence`."""
 
@@ -251,10 +258,12 @@ def find(
     judged = _judged(everything, bears_out, settings)
     size = fitting_size(judged, pose, search.pivot, planes_of(cine))
     apart = _apart(everything, pose, search.pivot, sizes)
-    sure = confidence, rival, settled.clock
+    looked_at = timing if settings.clock_offset != "ignore" else None
+    clocks = clocks_apart(everything.thinned(settings.max_frames), pose, search.pivot, looked_at)
     found = _Found(
-        pose, *sure, everything, calibration, breath_mm, bears_out, size, apart, misplaced
-    )
+        pose, confidence, rival, settled.clock, everything, calibration, breath_mm, bears_out,
+        size, apart, clocks, misplaced,
+    )  # fmt: skip
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
@@ -406,6 +415,7 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
         apart=found.apart,
+        clocks=found.clocks,
         misplaced=found.misplaced,
     )
     return judge(evidence, settings)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry import Integer, Mask
+from pipeline.registration.clock_offset import ClocksApart
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import AS_IT_IS, Size
 
@@ -67,6 +68,9 @@ class Evidence:
 
     apart: float = 0.0
     """By what share of the score parts of the recording agree better with poses of their own."""
+
+    clocks: ClocksApart | None = None
+    """Two sweeps that were stamped by different clocks."""
 
     misplaced: str = ""
     """How frames in the wrong place were displaced that reach the best score."""
@@ -216,6 +220,12 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
             f"parts of the recording agree {evidence.apart:.0%} better with poses of their own: "
             "was the patient, the tracker or the reference moved meanwhile, or is the calibration "
             "or the pixel size off?"
+        )
+    if evidence.clocks is not None:
+        ahead, behind, by_s = evidence.clocks.ahead, evidence.clocks.behind, evidence.clocks.by_s
+        reasons.append(
+            f"time stamps of sweep {ahead} are {by_s:.2f} s ahead of those of sweep {behind} by "
+            "the motion in their frames: put both on the clock of the ECG"
         )
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
