@@ -536,21 +536,26 @@ def test_a_lead_that_was_sampled_late_is_moved_and_the_end_is_cut(tmp_path):
     np.testing.assert_allclose(ecg.signal_mv, moved / 1000.0, rtol=0, atol=1e-9)
 
 
-def test_a_dicom_waveform_of_the_other_byte_order_is_the_same(tmp_path):
-    steps = STEPS_UV.copy()
-    steps[7, 0] = -32768
-    group = waveform_group(steps, "uV")
-    group.WaveformData = steps.astype(">i2").tobytes()
-    group.WaveformPaddingValue = b"\x80\x00"
+def write_big_endian(path, group):
     dataset = Dataset()
     dataset.file_meta = FileMetaDataset()
     dataset.file_meta.TransferSyntaxUID = ExplicitVRBigEndian
     dataset.SOPClassUID = pydicom.uid.TwelveLeadECGWaveformStorage
     dataset.SOPInstanceUID = "1.2.3"
     dataset.WaveformSequence = Sequence([group])
-    dataset.save_as(tmp_path / "ecg.dcm", enforce_file_format=True)
+    dataset.save_as(path, enforce_file_format=True)
+    return path
+
+
+def test_a_dicom_waveform_of_the_other_byte_order_is_the_same(tmp_path):
+    steps = STEPS_UV.copy()
+    steps[7, 0] = -32768
+    group = waveform_group(steps, "uV")
+    group.WaveformData = steps.astype(">i2").tobytes()
+    group.WaveformPaddingValue = b"\x80\x00"
+    ecg = read_ecg(write_big_endian(tmp_path / "ecg.dcm", group), gaps=True)
     wanted = np.where(steps == -32768, np.nan, steps / 1000.0)
-    np.testing.assert_allclose(read_ecg(tmp_path / "ecg.dcm", gaps=True).signal_mv, wanted)
+    np.testing.assert_allclose(ecg.signal_mv, wanted)
 
 
 def test_a_dicom_waveform_without_preamble_is_read(tmp_path):
@@ -584,4 +589,16 @@ def test_a_channel_of_a_dicom_group_that_is_no_voltage_is_left_out_beside_one(tm
     assert ecg.leads == ("I",)
     np.testing.assert_allclose(ecg.signal_mv, STEPS_UV[:, :1] / 1000.0)
     with pytest.raises(InputError, match="channel 'II' is in 'Ohm'"):
+        read_ecg(path)
+
+
+def test_a_dicom_waveform_of_the_other_byte_order_that_ends_within_a_sample_is_refused(tmp_path):
+    group = waveform_group(STEPS_UV, "uV")
+    group.WaveformData = STEPS_UV.astype(">i2").tobytes()
+    path = write_big_endian(tmp_path / "ecg.dcm", group)
+    with pydicom.dcmread(path) as dataset:
+        dataset.WaveformSequence[0].WaveformBitsAllocated = 32
+        dataset.WaveformSequence[0].WaveformData += b"\0\0"
+        dataset.save_as(path)
+    with pytest.raises(InputError, match="the waveform cannot be decoded"):
         read_ecg(path)

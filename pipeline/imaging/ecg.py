@@ -217,7 +217,6 @@ def _read_dicom(path: Path, gaps: bool) -> Ecg:
         raise InputError(
             f"{path}: how long its waveforms are cannot be understood ({error}); export it again"
         ) from error
-    _mend_group(dataset, groups[longest], path)
     return _dicom_group(dataset, longest, path, gaps)
 
 
@@ -265,6 +264,7 @@ def _dicom_group(dataset: Any, index: int, path: Path, gaps: bool) -> Ecg:
     """Decode one multiplex group of channels."""
     group = dataset.WaveformSequence[index]
     try:
+        _mend_group(dataset, group, path)
         signal = np.array(dataset.waveform_array(index), dtype=float)
         signal[_is_padding(dataset, index)] = np.nan
         channels = list(group.ChannelDefinitionSequence)
