@@ -14,17 +14,20 @@ from pydicom.dataset import Dataset
 
 from pipeline.errors import InputError
 from pipeline.imaging import dicom
-from pipeline.imaging.cine import Cine
+from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.dicom import read_dicom_study
+from pipeline.imaging.dicom_files import told_from_notes
 from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
     require_different_images,
     require_finite,
     require_room_for_a_heart,
+    without_blank_ends,
 )
 from pipeline.imaging.frames import Frame
 from pipeline.imaging.nifti import read_nifti_cine
+from pipeline.imaging.phases import common_phases, doubts_of_phases
 from pipeline.imaging.stack_choice import choose_stack
 from pipeline.study import open_study
 
@@ -387,3 +390,64 @@ def test_values_that_no_standard_knows_are_told(
     (tmp_path / "odd.dcm").write_bytes(content.replace(tag, value))
     with pytest.raises(InputError, match=rf"odd\.dcm: .*{words}"):
         read_dicom_study(tmp_path)
+
+
+@pytest.mark.parametrize("drawn", [(), (4,)])
+def test_slices_at_the_ends_that_show_nothing_are_left_out_and_told(drawn: tuple[int, ...]) -> None:
+    """Two below and one above; the places of the others stay, and their times go with them."""
+    full = np.random.default_rng(1).normal(size=(3, 8, 6, 7)).astype(np.float32)
+    full[:, [0, 1, 7]] = 5.0
+    full[1, 5] = 0.0
+    timed = tuple(k for k in range(8) if k not in drawn)
+    times_ms = np.arange(3) * 300.0 + np.array(timed)[:, None]
+    cine = Cine(full, STEP_8_MM, np.arange(3) / 3, 0.9, drawn)
+    told = timed if drawn else ()
+    stack = Stack(cine, times_ms, 900 + np.array(timed, float), "files", (), told, ("before",))
+    left = without_blank_ends(stack)
+    np.testing.assert_array_equal(left.cine.intensity, full[:, 2:7])
+    np.testing.assert_allclose(left.cine.mr_from_index @ [1, 2, 0, 1], STEP_8_MM @ [1, 2, 2, 1])
+    assert left.cine.interpolated == tuple(k - 2 for k in drawn)
+    stay = [k for k in timed if 2 <= k < 7]
+    np.testing.assert_array_equal(left.rr_ms, 900 + np.array(stay, float))
+    np.testing.assert_array_equal(left.trigger_times_ms[:, 0], stay)
+    assert left.timed == (tuple(k - 2 for k in stay) if drawn else ())
+    _, remark = left.remarks
+    assert remark.startswith("3 slices at the ends of the stack show nothing in any phase")
+    assert "slice 2 of the files is slice 0" in remark
+    # Nothing at the ends, or nothing at all: as it was.
+    assert without_blank_ends(left) is left
+    empty = replace(stack, cine=replace(cine, intensity=np.zeros_like(full)))
+    assert without_blank_ends(empty) is empty
+
+
+def test_a_slice_a_little_off_the_phases_of_many_is_told_and_one_further_off_refused() -> None:
+    """Of 30 phases half a step is a sixtieth of a beat: scanners tell RR intervals no better."""
+    times_ms = np.tile(np.arange(30) * 30.0, (12, 1))
+    rr_ms = np.full(12, 900.0)
+    assert doubts_of_phases(times_ms, rr_ms, range(12)) == ()
+    rr_ms[4] = 900 * 1.03
+    np.testing.assert_allclose(
+        common_phases(times_ms, rr_ms, "here"), np.arange(30) / 30, atol=4e-3
+    )
+    [told] = doubts_of_phases(times_ms, rr_ms, range(5, 17))
+    assert told.startswith("slice 9 lies 0.026 of a cycle off")
+    rr_ms[4] = 900 * 1.07
+    with pytest.raises(InputError, match=r"slice 4 lies .* at most 0\.050 off .* cine\.rr_ms"):
+        common_phases(times_ms, rr_ms, "here")
+    # Where one interval was given for all, to give one is no remedy.
+    times_ms[4] += 60.0
+    with pytest.raises(InputError, match=r"slice 4 lies .* correct its times, or leave the slice"):
+        common_phases(times_ms[:, :28], np.full(12, 900.0), "here")
+
+
+def test_what_is_text_beside_images_is_no_damaged_image(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "im")
+    image = next(path for path in (tmp_path / "im").rglob("*") if path.is_file())
+    texts = [tmp_path / "manifest.cvs", tmp_path / "contour.con"]
+    for path in texts:
+        path.write_text("1.0 2.0\n3.0 4.0\n")
+    assert told_from_notes([image, *texts]) == ([image], texts)
+    scanners = tmp_path / "0001.dcm"
+    scanners.write_text("1.0 2.0\n")
+    with pytest.raises(InputError, match=r"0001\.dcm: is not DICOM, or damaged"):
+        told_from_notes([image, scanners])

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from pipeline.errors import InputError
 from pipeline.geometry import transform_points
 from pipeline.imaging.nifti import read_image, read_nifti_cine, read_nifti_views, write_image
+from pipeline.imaging.nifti_doubts import doubts_of_place
 
 
 def nifti_cine(path: Path, affine_ras: Any, step_s: float | None = 0.16) -> None:
@@ -377,3 +378,12 @@ def test_placements_half_a_millimetre_apart_are_told(
     nibabel.save(image, tmp_path / "cine.nii.gz")
     remarks = read_nifti_cine(tmp_path / "cine.nii.gz", None, 800).remarks
     assert len([one for one in remarks if "sform and qform" in one]) == told
+
+
+def test_a_matrix_of_other_sizes_than_the_list_is_told(tmp_path: Path) -> None:
+    """As tools leave it that change one of the two."""
+    image = nibabel.Nifti1Image(np.ones((8, 9, 10, 3), np.float32), np.diag([-8.0, -8, 6, 1]))
+    assert doubts_of_place(image) == ()
+    image.header["pixdim"][3] = 10
+    [told] = doubts_of_place(image)
+    assert "matrix has voxels of 8 x 8 x 6 and its pixdim of 8 x 8 x 10" in told

@@ -153,6 +153,14 @@ def test_a_blank_image_is_named(study):
         segment_cine(with_image(images, 1, 7, 0.0), QUICK)
 
 
+def test_a_phase_that_shows_nothing_is_named(study):
+    images, _ = study
+    intensity = images.intensity.copy()
+    intensity[1] = 3.0
+    with pytest.raises(StageError, match=r"phase 1: no heart found: .* leave phase 1 out"):
+        segment_cine(replace(images, intensity=intensity), QUICK)
+
+
 def beating(phases=6, slices=5, side=64):
     """A shrinking and growing bright disc in textured surroundings, and its labels' chances."""
     rng = np.random.default_rng(3)

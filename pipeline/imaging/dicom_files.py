@@ -22,6 +22,9 @@ NOTES = (
 )
 """Ends of names of what people keep beside images; no scanner's file is called so."""
 
+OF_SCANNERS = (".dcm", ".ima")
+"""Ends of names of scanners' own files: one that is text is damaged."""
+
 VIEWERS = (
     *(".exe", ".dll", ".msi", ".bat", ".cmd", ".inf", ".ini", ".cfg", ".jar", ".class", ".ico"),
     *(".lnk", ".chm", ".css", ".js", ".svg", ".ttf", ".sys", ".so", ".dylib", ".properties"),
@@ -71,8 +74,11 @@ def told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def _is_note(path: Path) -> bool:
-    if path.suffix:
-        return path.name.lower().endswith((*NOTES, *VIEWERS))
+    name = path.name.lower()
+    if name.endswith((*NOTES, *VIEWERS)):
+        return True
+    if name.endswith((*OF_SCANNERS, *OTHER_IMAGES, *ARCHIVES)):
+        return False
     with path.open("rb") as handle:
         begins = handle.read(TEXT_BYTES)
     # An image that lost its beginning holds bytes that no text does.

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
-from pipeline.imaging.cine import Cine
+from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.spacing import WIDEST_GAP_MM
 
 SLICES_GAIN, PHASES_GAIN = 0.04, 0.12
@@ -97,6 +97,39 @@ def redraw_slices(cine: Cine, spoilt: Sequence[int], where: str) -> Cine:
     for number in spoilt:
         intensity[:, number] = (intensity[:, number - 1] + intensity[:, number + 1]) / 2
     return replace(cine, intensity=intensity, interpolated=tuple(sorted(lacking)))
+
+
+def without_blank_ends(stack: Stack) -> Stack:
+    """The stack without the slices at its ends that show nothing in any phase, as some data sets
+    pad theirs; what was left out is told."""
+    cine = stack.cine
+    blank = (np.ptp(cine.intensity, axis=(2, 3)) == 0).all(axis=0)
+    if blank.all() or not (blank[0] or blank[-1]):
+        return stack
+    shown = np.flatnonzero(~blank)
+    first, kept = int(shown[0]), slice(shown[0], shown[-1] + 1)
+    frame = cine.mr_from_index.copy()
+    frame[:3, 3] += first * frame[:3, 2]
+    within = range(*kept.indices(len(blank)))
+    numbers = np.array(stack.timed or range(len(blank)))
+    timed = np.isin(numbers, within)
+    remark = (
+        f"{len(blank) - len(within)} slices at the ends of the stack show nothing in any phase and "
+        f"are left out: slice {first} of the files is slice 0 from here on"
+    )
+    return replace(
+        stack,
+        cine=replace(
+            cine,
+            intensity=cine.intensity[:, kept],
+            mr_from_index=frame,
+            interpolated=tuple(one - first for one in cine.interpolated if one in within),
+        ),
+        trigger_times_ms=stack.trigger_times_ms[timed],
+        rr_ms=stack.rr_ms[timed],
+        timed=tuple(int(one) - first for one in numbers[timed]) if stack.timed else (),
+        remarks=(*stack.remarks, remark),
+    )
 
 
 def require_different_images(cine: Cine, where: str) -> tuple[str, ...]:

@@ -16,6 +16,9 @@ MOST_LABELS = 10
 SAME_PLACE_MM = 0.5
 """By which two placements of one stack may differ: less than a pixel."""
 
+SAME_SIZE = 0.01
+"""Share by which two sizes of one voxel may differ."""
+
 LEAST_HEIGHT_MM = 60
 """No stack of fewer millimetres holds a heart from tip to valves."""
 
@@ -43,7 +46,25 @@ def doubts_of_values(phase: Float32) -> tuple[str, ...]:
 
 
 def doubts_of_place(image: Any) -> tuple[str, ...]:
-    """What the header's two placements leave open, in words."""
+    """What the header's placements leave open, in words."""
+    return (*_doubts_of_edges(image), *_doubts_of_placements(image))
+
+
+def _doubts_of_edges(image: Any) -> tuple[str, ...]:
+    """What the header's matrix and its list of sizes leave open: programs take either."""
+    by_matrix = np.linalg.norm(image.affine[:3, :3], axis=0)
+    by_list = np.array(image.header.get_zooms()[:3], dtype=float)
+    if np.allclose(by_matrix, by_list, rtol=SAME_SIZE, atol=0):
+        return ()
+    taken, other = (" x ".join(f"{one:.4g}" for one in edges) for edges in (by_matrix, by_list))
+    return (
+        f"the NIfTI header's matrix has voxels of {taken} and its pixdim of {other}: the matrix is "
+        "taken, and volumes go with it; which is right?",
+    )
+
+
+def _doubts_of_placements(image: Any) -> tuple[str, ...]:
+    """What the header's sform and qform leave open."""
     by_sform, sform = image.get_sform(coded=True)
     by_qform, qform = image.get_qform(coded=True)
     if sform == 0 and qform == 0:

@@ -10,6 +10,10 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.frames import LEAST_OF_A_BEAT
 
+ALIKE = 0.05
+"""Share of a beat, some 45 ms, by which a slice may be seen earlier or later than others, however
+many phases there are: RR intervals of breath-holds are told no better by some scanners."""
+
 PLAUSIBLE_RR_S = (0.2, 3.0)
 """300 to 20 beats a minute: an RR interval outside is a unit mistaken, not a heart."""
 
@@ -33,7 +37,7 @@ def common_phases(
     InputError
         When an RR interval is implausible, a trigger time lies outside its heartbeat, all lie
         within a small part of it, or of n phases those of a slice are over half an n-th of a cycle
-        away from the others'.
+        and over `ALIKE` away from the others'.
     """
     numbers = range(len(rr_ms)) if numbers is None else numbers
     _require_heartbeats(rr_ms, where)
@@ -41,7 +45,7 @@ def common_phases(
     _require_within_beats(phases, trigger_times_ms, rr_ms, where, numbers)
     common = phases.mean(axis=0)
     _require_rising(common, trigger_times_ms, rr_ms, where)
-    _require_alike(phases, common, where, numbers)
+    _require_alike(phases, rr_ms, where, numbers)
     return np.asarray(common)
 
 
@@ -99,14 +103,38 @@ def _require_rising(common: Float, trigger_times_ms: Float, rr_ms: Float, where:
         )
 
 
-def _require_alike(phases: Float, common: Float, where: str, numbers: Sequence[int]) -> None:
+def _require_alike(phases: Float, rr_ms: Float, where: str, numbers: Sequence[int]) -> None:
     """Refuse slices that are seen at other phases than the rest."""
-    away = np.abs(phases - common).max(axis=1)
-    if away.max() > 0.5 / phases.shape[1]:
+    away, allowed = _away(phases), max(ALIKE, 0.5 / phases.shape[1])
+    if away.max() > allowed:
+        remedy = "correct its times, or leave the slice out"
+        if np.ptp(rr_ms) > 0:
+            remedy = (
+                "where times after the R peak are the same in all slices and RR intervals differ, "
+                "cine.rr_ms in study.yaml puts all on one"
+            )
         raise InputError(
             f"{where}: slice {numbers[int(away.argmax())]} lies {away.max():.3f} of a cycle off "
             f"the other slices' phases; of {phases.shape[1]} phases those that are at most "
-            f"{0.5 / phases.shape[1]:.3f} off can be used; "
-            "all slices need the same phases; where times after the R peak are the same in all "
-            "slices and RR intervals differ, cine.rr_ms in study.yaml puts all on one"
+            f"{allowed:.3f} off can be used; all slices need the same phases; {remedy}"
         )
+
+
+def _away(phases: Float) -> Float:
+    """How far each slice's phases ``(slice, phase)`` are off the common ones at most."""
+    return np.asarray(np.abs(phases - phases.mean(axis=0)).max(axis=1))
+
+
+def doubts_of_phases(
+    trigger_times_ms: Float, rr_ms: Float, numbers: Sequence[int]
+) -> tuple[str, ...]:
+    """What speaks against slices being seen at the same phases, in words; see `common_phases`."""
+    away = _away(trigger_times_ms / rr_ms[:, None])
+    half_step = 0.5 / trigger_times_ms.shape[1]
+    if away.max() <= half_step:
+        return ()
+    return (
+        f"slice {numbers[int(away.argmax())]} lies {away.max():.3f} of a cycle off the other "
+        f"slices' phases, more than half the step from phase to phase ({half_step:.3f}): its "
+        "trigger times or its RR interval may be inexact",
+    )

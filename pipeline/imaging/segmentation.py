@@ -152,6 +152,12 @@ def _require_contrast(cine: Cine) -> None:
     blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
     if not blank.any():
         return
+    empty = np.flatnonzero(blank.all(axis=1))
+    if len(empty):
+        raise StageError(
+            f"phase {empty[0]}: no heart found: all pixels of all its slices are alike; leave "
+            f"phase {', '.join(map(str, empty))} out of the files, and out of their times"
+        )
     phase, number = np.argwhere(blank)[0]
     spoilt = blank.any(axis=0)
     # From each end of the stack inwards, as far as slices are blank without a break.

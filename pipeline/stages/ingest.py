@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +17,10 @@ from pipeline.imaging.faults import (
     redraw_slices,
     require_different_images,
     require_finite,
+    without_blank_ends,
 )
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
+from pipeline.imaging.phases import doubts_of_phases
 from pipeline.job import Job
 from pipeline.products import write_cine
 from pipeline.registration.time import detect_r_peaks, median_rr_s
@@ -45,6 +48,7 @@ def run(job: Job) -> dict[str, Any]:
     where = f"{job.study.folder / 'study.yaml'}: cine.spoilt_slices"
     stack = replace(stack, cine=redraw_slices(stack.cine, files.spoilt_slices, where))
     require_finite(stack.cine, str(files.path))
+    stack = without_blank_ends(stack)
     copies = require_different_images(stack.cine, str(files.path))
     for view in views:
         require_finite(view.cine, f"long-axis view {view.name}")
@@ -65,6 +69,7 @@ def run(job: Job) -> dict[str, Any]:
             *stack.remarks,
             *copies,
             *doubts_of_order(stack.cine),
+            *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, _timed(stack)),
             *_doubts_of_beat(job, stack, ecg),
             *_doubts_of_patient(job, stack, ecg),
         ],
@@ -126,6 +131,11 @@ def _require_ecg_as_long(job: Job, stack: Stack, ecg: Ecg | None) -> None:
             f"{len(beats_ms)} slices of a heartbeat each take {needed_s:.1f} s at the least; "
             "give the whole record, or take it out of the study"
         )
+
+
+def _timed(stack: Stack) -> Sequence[int]:
+    """Numbers of the slices that the times are of."""
+    return stack.timed or range(len(stack.rr_ms))
 
 
 def _is_volume(stack: Stack) -> bool:
