@@ -245,11 +245,28 @@ def test_times_without_a_unit_or_in_the_wrong_one_are_told(tmp_path: Path) -> No
     nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=0.15)
     with pytest.raises(InputError, match=r"RR interval 0\.9 ms, .*as if told in seconds; correct"):
         read_nifti_cine(tmp_path / "cine.nii", None, rr_ms=0.9)
+
+
+@pytest.mark.parametrize(
+    ("step", "rr_s"), [(0.15, 0.75), (150.0, 0.75), (1.0, None), (0.01, None), (5000.0, None)]
+)
+def test_a_step_without_a_unit_is_that_of_a_heartbeat_or_none(
+    tmp_path: Path, step: float, rr_s: float | None
+) -> None:
+    """Of five phases; a step of 1 is what programs write that know none."""
+    nifti_cine(tmp_path / "cine.nii", np.diag([1, 1, 8, 1.0]), step_s=0.15)
     image = nibabel.load(tmp_path / "cine.nii")
     image.header.set_xyzt_units("mm", "unknown")
+    image.header["pixdim"][4] = step
     nibabel.save(image, tmp_path / "other.nii")
-    with pytest.raises(InputError, match=r"a time step of 0\.15 without a unit in its header"):
-        read_nifti_cine(tmp_path / "other.nii", None)
+    if rr_s is None:
+        with pytest.raises(InputError, match=rf"a time step of {step:g} without a unit in its hea"):
+            read_nifti_cine(tmp_path / "other.nii", None)
+        return
+    stack = read_nifti_cine(tmp_path / "other.nii", None)
+    assert stack.cine.rr_s == pytest.approx(rr_s)
+    assert stack.remarks[-1].startswith(f"the NIfTI header's time step of {step:g} has no unit")
+    assert "makes a beat of 750 ms" in stack.remarks[-1]
 
 
 @pytest.mark.parametrize("step_s", [None, 1.0, 0.16])

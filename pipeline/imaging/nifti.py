@@ -126,7 +126,7 @@ def read_nifti_cine(path: Path, timing: Path | None, rr_ms: float | None = None)
     doubts = (
         *doubts_of_size(edges_mm, intensity.shape[1]),
         *doubts_of_place(image),
-        *(doubts_of_step(_step_ms(image), _notes(path)) if source == HEADER_STEP else ()),
+        *(_doubts_of_header_step(image, path) if source == HEADER_STEP else ()),
         *doubts_of_values(cine.intensity[0]),
     )
     return Stack(cine, triggers, own_rr_ms, source, (), remarks=doubts)
@@ -316,8 +316,28 @@ def _unit_of_time(image: Any) -> str:
 
 
 def _step_ms(image: Any) -> float:
-    unit = _unit_of_time(image)
-    return 1000 * float(image.header.get_zooms()[3]) * SECONDS_PER_UNIT.get(unit, 0.0)
+    """Time from phase to phase; of a unit that is not told the one by which phases make a
+    heartbeat, but for a step of 1, which programs write that know none. 0 where there is none."""
+    unit, step = _unit_of_time(image), float(image.header.get_zooms()[3])
+    if unit != "unknown" or step == 1:
+        return 1000 * step * SECONDS_PER_UNIT.get(unit, 0.0)
+    low_s, high_s = PLAUSIBLE_RR_S
+    lasts = step * image.shape[3]
+    return next((1000 * step * one for one in (1.0, 1e-3) if low_s < lasts * one < high_s), 0.0)
+
+
+def _doubts_of_header_step(image: Any, path: Path) -> tuple[str, ...]:
+    """What speaks against the time step by which the beat is told, in words."""
+    step_ms = _step_ms(image)
+    doubts = doubts_of_step(step_ms, _notes(path))
+    if _unit_of_time(image) != "unknown":
+        return doubts
+    step, beat_ms = float(image.header.get_zooms()[3]), step_ms * image.shape[3]
+    return (
+        *doubts,
+        f"the NIfTI header's time step of {step:g} has no unit; as {step_ms:.4g} ms it makes a "
+        f"beat of {beat_ms:.0f} ms, and so it was taken: else give cine.rr_ms in study.yaml",
+    )
 
 
 def _header_rr_ms(image: Any, path: Path, phases: int) -> float:
