@@ -204,7 +204,8 @@ def _require_timing(frames: Sequence[Frame]) -> None:
         raise InputError(
             f"{untimed[0].where}: has no trigger time, as {len(untimed)} of the stack's "
             f"{len(frames)} images; the others have: export these again with TriggerTime "
-            "(0018,1060)"
+            f"(0018,1060), or do without {untimed[0].series}: name its number in "
+            "cine.leave_out_series in study.yaml, with cine.fill_gaps: true inside the stack"
         )
     if untimed:
         raise InputError(
