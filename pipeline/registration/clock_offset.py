@@ -37,6 +37,8 @@ SIGNIFICANT = 3.0
 """An offset of fewer standard deviations than this may be none."""
 LEAST_APART_S = 0.050
 """Clocks of sweeps that are nearer than this are one."""
+# So many frames of a sweep tell its own clock to some milliseconds.
+_OWN_FRAMES = 40
 # Trial offsets: fine enough not to step over a summit, which is some 100 ms wide.
 _SCAN_S = 0.020
 # Half the profile's width by which it is followed to its summit: more than half the time between
@@ -240,7 +242,8 @@ def clocks_apart(
     sweep = level.samples.sweep([len(times_s) for times_s in timing.times_s])
     told: dict[int, tuple[float, float]] = {}
     for number in np.unique(sweep).tolist():
-        own = level.only(np.flatnonzero(sweep == number))
+        # Each sweep by itself, or of many none would have frames enough.
+        own = level.only(np.flatnonzero(sweep == number)).thinned(_OWN_FRAMES)
         found = _own_offset(own, pose, pivot, timing)
         if found is not None:
             told[number + 1] = found

@@ -259,7 +259,7 @@ def find(
     size = fitting_size(judged, pose, search.pivot, planes_of(cine))
     apart = _apart(everything, pose, search.pivot, sizes)
     looked_at = timing if settings.clock_offset != "ignore" else None
-    clocks = clocks_apart(everything.thinned(settings.max_frames), pose, search.pivot, looked_at)
+    clocks = clocks_apart(everything, pose, search.pivot, looked_at)
     found = _Found(
         pose, confidence, rival, settled.clock, everything, calibration, breath_mm, bears_out,
         size, apart, clocks, misplaced,
