@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.frames import MIN_SLICES
 from pipeline.imaging.spacing import WIDEST_GAP_MM
 
 SLICES_GAIN, PHASES_GAIN = 0.04, 0.12
@@ -104,9 +105,10 @@ def without_blank_ends(stack: Stack) -> Stack:
     pad theirs; what was left out is told."""
     cine = stack.cine
     blank = (np.ptp(cine.intensity, axis=(2, 3)) == 0).all(axis=0)
-    if blank.all() or not (blank[0] or blank[-1]):
-        return stack
     shown = np.flatnonzero(~blank)
+    # Where hardly any slice shows something, that is for whoever looks at the images to say.
+    if len(shown) < MIN_SLICES or not (blank[0] or blank[-1]):
+        return stack
     first, kept = int(shown[0]), slice(shown[0], shown[-1] + 1)
     frame = cine.mr_from_index.copy()
     frame[:3, 3] += first * frame[:3, 2]

@@ -267,6 +267,13 @@ def find(
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
     tell(_STEPS, _STEPS)
+    return _naming_what_is_unknown(result, lacking, open_above, cut)
+
+
+def _naming_what_is_unknown(
+    result: Registration, lacking: Sequence[str], open_above: Sequence[str], cut: Sequence[str]
+) -> Registration:
+    """The result with what its model does not know, where it is not good."""
     if lacking and result.reason:
         said = f"the model lacks {', '.join(lacking)}"
         if not set(lacking) <= set(open_above):
