@@ -186,13 +186,16 @@ def whole_heart(values: tuple[float, ...]) -> float:
 
 @compiled
 def vessel_at(x: float, y: float, z: float, trunk: float, tubes: Tubes) -> float:
-    """Distance to the nearest vessel that is no body of its own; ``trunk`` is the pulmonary."""
-    boxes, best = tubes.boxes, trunk
-    best = min(best, boxed_tube(x, y, z, tubes.right_branch, boxes[5], min(best, VESSEL_REACH_MM)))
-    best = min(best, boxed_tube(x, y, z, tubes.left_branch, boxes[6], min(best, VESSEL_REACH_MM)))
-    best = min(best, boxed_tube(x, y, z, tubes.upper_cava, boxes[7], min(best, VESSEL_REACH_MM)))
-    best = min(best, boxed_tube(x, y, z, tubes.lower_cava, boxes[8], min(best, VESSEL_REACH_MM)))
-    if box_distance(x, y, z, boxes[3]) < min(best, VESSEL_REACH_MM):
+    """Distance to the nearest vessel that is no body of its own; ``trunk`` is the pulmonary.
+
+    Where nothing is nearer than VESSEL_FAT_MM, some value that is no less.
+    """
+    boxes, best, far = tubes.boxes, trunk, VESSEL_FAT_MM
+    best = min(best, boxed_tube(x, y, z, tubes.right_branch, boxes[5], min(best, far)))
+    best = min(best, boxed_tube(x, y, z, tubes.left_branch, boxes[6], min(best, far)))
+    best = min(best, boxed_tube(x, y, z, tubes.upper_cava, boxes[7], min(best, far)))
+    best = min(best, boxed_tube(x, y, z, tubes.lower_cava, boxes[8], min(best, far)))
+    if box_distance(x, y, z, boxes[3]) < min(best, far):
         for k in range(4):
             best = min(best, tube(x, y, z, tubes.veins[k, 1:]))
     return best

@@ -31,13 +31,16 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
     The compiler looks at a function's own file alone to tell whether its stored code still holds,
     not at those of the functions it calls. So the folder is named by the sources of all.
+
+    Calls are compiled into their callers: a call hands over every number of a heart, which costs
+    more than most of these functions do.
     """
     usual = config.CACHE_DIR
     config.CACHE_DIR = str(Path(usual or _place()) / _digest())
     try:
         return cast(
             "Callable[Parameters, Result]",
-            njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function),
+            njit(cache=True, nogil=True, no_cfunc_wrapper=True, forceinline=True)(function),
         )
     finally:
         config.CACHE_DIR = usual
