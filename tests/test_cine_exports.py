@@ -263,7 +263,10 @@ def most_missing(data: FileDataset, number: int, phase: int) -> bool:
     ("change", "words"),
     [
         (most_missing, "missing slice between"),
-        (again_beside_its_place, "slices 2 and 3 lie 1.00 mm apart.*given twice, by images of"),
+        (
+            again_beside_its_place,
+            "given twice, .*slices 2 and 3 lie 1.00 mm apart: images of.*leave_out",
+        ),
         (without_times, "do not tell its phases apart"),
         (prospective, "same in all slices and RR intervals differ, cine.rr_ms"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from cine_files import (
 from pydicom.dataset import FileDataset
 
 from pipeline.errors import InputError
+from pipeline.imaging.dicom import read_dicom_study
 
 
 def test_a_derived_series_gives_the_slice_that_the_originals_lack_alone(tmp_path: Path) -> None:
@@ -110,3 +112,36 @@ def test_two_echoes_in_one_series_are_told_as_that(tmp_path: Path) -> None:
         data.save_as(tmp_path / f"0{phase:03d}_other.dcm")
     with pytest.raises(InputError, match=r'both are of series 1 "cine".*take the files of one out'):
         read_dicom_cine(tmp_path)
+
+
+def taken_again(folder: Path, repeats: Callable[[int], int | None]) -> str:
+    """What is said of a stack of which slices were taken again, each in the series that
+    ``repeats`` numbers."""
+    write_dicom(folder, lambda data, number, phase: bool(in_series(data, 1, "short axis")))
+    for k, (number, phase) in enumerate(ALL_FRAMES):
+        again = repeats(number)
+        if again is not None:
+            data = in_series(dicom_frame(number, phase), again, "again")
+            data.PixelData = (data.pixel_array + 3).tobytes()
+            data.save_as(folder / f"again_{k}.dcm")
+    with pytest.raises(InputError) as raised:
+        read_dicom_cine(folder)
+    return str(raised.value)
+
+
+def test_all_slices_that_were_taken_again_are_named_at_once(tmp_path: Path) -> None:
+    """By a series each, or by one of all; what the message says to leave out is enough."""
+    said = taken_again(tmp_path / "each", lambda number: 11 + number if number != 2 else None)
+    for number in (0, 1, 3):
+        words = f'slice {number} is given twice: by series 1 "short axis", '
+        assert words in said
+        assert f'by series {11 + number} "again", {PHASES} images' in said
+    assert "slice 2 is" not in said
+    assert said.count("cine.leave_out_series in study.yaml, which takes several") == 1
+    without = read_dicom_study(tmp_path / "each", without_series=(11, 12, 14))[0]
+    np.testing.assert_array_equal(without.cine.intensity[2, 3], pixel_value(2, 3))
+    said = taken_again(tmp_path / "one", lambda number: 9)
+    assert "slices 0 to 3 are given twice" in said
+    assert said.count("given twice") == 1
+    said = taken_again(tmp_path / "some", lambda number: 9 if number != 1 else None)
+    assert "slices 0, 2 to 3 are given twice" in said

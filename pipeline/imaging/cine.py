@@ -14,6 +14,7 @@ from pipeline.imaging.frames import (
     LEAVE_OUT,
     MIN_PHASES,
     MIN_SLICES,
+    SEVERAL,
     Frame,
     by_slice,
     is_stack,
@@ -21,7 +22,7 @@ from pipeline.imaging.frames import (
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.phases import common_phases
-from pipeline.imaging.spacing import fill_gaps, regular_steps
+from pipeline.imaging.spacing import MOST_TOLD, fill_gaps, regular_steps
 from pipeline.imaging.stack_choice import choose_stack, stacks_beside
 
 EVENLY = (
@@ -287,23 +288,62 @@ def _tie(ordered: Sequence[Frame], name: str) -> tuple[Frame, Frame] | None:
 
 
 def _require_given_once(slices: Sequence[Sequence[Frame]], name: str, where: str) -> None:
-    """Refuse a slice that two series, or two acquisitions of one, show over the same part of the
-    heartbeat."""
+    """Refuse slices that two series, or two acquisitions of one, show over the same part of the
+    heartbeat; all of them at once, for each is mended by the same hand."""
+    found: dict[tuple[object, object], list[int]] = {}
+    firsts: list[tuple[Sequence[Frame], Sequence[Frame]]] = []
     for number, one in enumerate(slices):
-        together: dict[object, list[Frame]] = {}
-        for frame in one:
-            together.setdefault((frame.series_uid, frame.acquisition), []).append(frame)
-        spans = sorted(
-            (found for found in together.values() if len(found) >= MIN_PHASES),
-            key=lambda found: (found[0].times_ms[name], found[0].series),
-        )
-        for first, second in pairwise(spans):
-            if second[0].times_ms[name] < first[-1].times_ms[name]:
-                raise InputError(
-                    f"{where}: slice {number} is given twice: by {_origin(first)}, and by "
-                    f"{_origin(second)}, which show the same trigger time or overlap; "
-                    f"{_keep_one(first[0], second[0])}"
-                )
+        for first, second in _given_twice(one, name):
+            pair = _source(first[0]), _source(second[0])
+            if pair not in found:
+                firsts.append((first, second))
+            found.setdefault(pair, []).append(number)
+    if not found:
+        return
+    told = [
+        f"{_slices_are(numbers)} given twice: by {_origin(first)}, and by {_origin(second)}"
+        for numbers, (first, second) in zip(found.values(), firsts, strict=True)
+    ]
+    more = len(told) - MOST_TOLD
+    rest = [f"and so on, {more} more"] if more > 0 else []
+    # Of two series all numbers may be left out in one line; of one series only files can be.
+    remedies = dict.fromkeys(_keep_one(first[0], second[0]) for first, second in firsts)
+    raise InputError(
+        f"{where}: {'; '.join([*told[:MOST_TOLD], *rest])}; they show the same trigger time or "
+        f"overlap; {'; '.join(remedies)}"
+    )
+
+
+def _given_twice(one: Sequence[Frame], name: str) -> list[tuple[Sequence[Frame], Sequence[Frame]]]:
+    """Pairs of series or acquisitions that show one slice over the same part of the heartbeat."""
+    together: dict[object, list[Frame]] = {}
+    for frame in one:
+        together.setdefault(_source(frame), []).append(frame)
+    spans = sorted(
+        (found for found in together.values() if len(found) >= MIN_PHASES),
+        key=lambda found: (found[0].times_ms[name], found[0].series),
+    )
+    return [
+        (first, second)
+        for first, second in pairwise(spans)
+        if second[0].times_ms[name] < first[-1].times_ms[name]
+    ]
+
+
+def _source(frame: Frame) -> object:
+    """What tells apart the series, and acquisitions of one, that show a slice."""
+    return frame.series_uid, frame.acquisition
+
+
+def _slices_are(numbers: Sequence[int]) -> str:
+    """Rising numbers of slices, runs as their ends, as the subject of a sentence."""
+    if len(numbers) == 1:
+        return f"slice {numbers[0]} is"
+    breaks = np.flatnonzero(np.diff(numbers) > 1) + 1
+    runs = np.split(np.array(numbers), breaks)
+    told = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
+    more = [f"{len(told) - MOST_TOLD} more"] if len(told) > MOST_TOLD else []
+    return f"slices {', '.join([*told[:MOST_TOLD], *more])} are"
 
 
 def _origin(frames: Sequence[Frame]) -> str:
@@ -316,7 +356,7 @@ def _keep_one(first: Frame, second: Frame) -> str:
     """What to do about a slice that two sets of images show."""
     if first.series == second.series:
         return "keep one acquisition a slice: take the other's files out"
-    return f"keep one series a slice: {LEAVE_OUT}"
+    return f"keep one series a slice: {LEAVE_OUT}, {SEVERAL}"
 
 
 def _intensity(slices: Sequence[Sequence[Frame]]) -> Float32:

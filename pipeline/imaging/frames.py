@@ -27,6 +27,7 @@ MANY_BEATS = 1.5
 """Times beyond so many RR intervals are of more than one beat, not of one that was long."""
 
 LEAVE_OUT = "take the other's files out, or name its number in cine.leave_out_series in study.yaml"
+SEVERAL = "which takes several, as [12, 15]"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,14 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
-from pipeline.imaging.frames import LEAVE_OUT, Frame
+from pipeline.imaging.frames import LEAVE_OUT, SEVERAL, Frame
 
 NEARLY_ONE, NEARLY_ONE_MM = 0.4, 4.0
 """A step of less than this share of the median one, and than this, is none: with slices missing the
 step may be half of the median or less."""
+
+MOST_TOLD = 16
+"""Of repeated slices so many are told in one message: more than a stack usually has."""
 
 WIDEST_GAP_MM = 25.0
 """Across a wider gap nothing is interpolated: an apex or a valve plane would fit in it."""
@@ -127,16 +130,21 @@ def _require_one_place(slices: Sequence[Sequence[Frame]], allowed_mm: float, whe
 
 
 def _require_no_second(slices: Sequence[Sequence[Frame]], lengths_mm: Float, where: str) -> None:
-    """Refuse a slice that was taken again beside its first place."""
-    short = np.flatnonzero(lengths_mm < min(NEARLY_ONE * np.median(lengths_mm), NEARLY_ONE_MM))
-    if len(short):
-        first, second = (slices[short[0] + k][0] for k in (0, 1))
-        raise InputError(
-            f"{where}: slices {short[0]} and {short[0] + 1} lie {lengths_mm[short[0]]:.2f} mm "
-            f"apart, others {np.median(lengths_mm):.2f} mm: nearly the same slice is given "
-            f"twice, by {first.series} ({first.where}) and by {second.series} ({second.where}); "
-            f"keep one: {LEAVE_OUT}"
-        )
+    """Refuse slices that were taken again beside their first place."""
+    usual_mm = float(np.median(lengths_mm))
+    short = np.flatnonzero(lengths_mm < min(NEARLY_ONE * usual_mm, NEARLY_ONE_MM)).tolist()
+    if not short:
+        return
+    told = [
+        f"slices {k} and {k + 1} lie {lengths_mm[k]:.2f} mm apart: {slices[k][0].series} "
+        f"({slices[k][0].where}), and {slices[k + 1][0].series} ({slices[k + 1][0].where})"
+        for k in short[:MOST_TOLD]
+    ]
+    rest = [f"and so on, {len(short) - MOST_TOLD} more"] if len(short) > MOST_TOLD else []
+    raise InputError(
+        f"{where}: nearly the same slice is given twice, for others lie {usual_mm:.2f} mm apart: "
+        f"{'; '.join([*told, *rest])}; keep one of each two: {LEAVE_OUT}, {SEVERAL}"
+    )
 
 
 def fill_gaps(intensity: Float32, numbers: Integer) -> tuple[Float32, tuple[int, ...]]:
