@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from cine_files import NORMAL, ORIGIN_MM, PHASES, SLICES, STEP_MM, pixel_value, write_dicom
+from cine_files import (
+    NORMAL,
+    ORIGIN_MM,
+    PHASES,
+    ROW_AXIS,
+    SLICES,
+    STEP_MM,
+    pixel_value,
+    write_dicom,
+)
 
 from pipeline.errors import InputError
 from pipeline.imaging.cine import Cine
@@ -114,23 +125,62 @@ def test_planes_unevenly_spaced_give_the_body_that_evenly_spaced_ones_give() -> 
     assert (whole != parts).sum() < outline / 4
 
 
-@pytest.mark.parametrize(("aside_mm", "fits"), [(0.02, True), (0.5, False)])
-def test_positions_of_few_decimals_are_straightened_and_a_leaning_stack_is_refused(
-    tmp_path: Path, aside_mm: float, fits: bool
-) -> None:
-    def lean(data: Any, number: int, phase: int) -> bool:
+def beside(asides_mm: Sequence[float]) -> Any:
+    """Slices moved in their plane, along their rows, by so much each."""
+
+    def change(data: Any, number: int, phase: int) -> bool:
         across = np.array(data.ImageOrientationPatient[:3], dtype=float)
         place_mm = np.array(data.ImagePositionPatient, dtype=float)
-        data.ImagePositionPatient = (place_mm + number * aside_mm * across).tolist()
+        data.ImagePositionPatient = (place_mm + asides_mm[number] * across).tolist()
         return True
 
-    write_dicom(tmp_path / "cine", lean)
-    if not fits:
-        with pytest.raises(InputError, match=r"shifted sideways.* by 1\.50 mm"):
-            read_dicom_study(tmp_path / "cine")
-        return
+    return change
+
+
+@pytest.mark.parametrize(
+    ("asides_mm", "told"),
+    [
+        ((0, 0.02, 0.04, 0.06), None),
+        ((0, 0, 0.6, 0), r"1 of 4 slices lie up to 0\.60 mm \(slice 2\)"),
+        ((0.6, 0, 0, 0), r"1 of 4 slices lie up to 0\.60 mm \(slice 0\)"),
+        ((0, 0.3, 0.6, 0.9), r"2 of 4 slices lie up to 0\.45 mm"),
+    ],
+)
+def test_slices_less_than_half_a_pixel_aside_are_drawn_on_one_line_and_told(
+    tmp_path: Path, asides_mm: tuple[float, ...], told: str | None
+) -> None:
+    """Of pixels of 1.25 mm. By DICOM's equation (C.7.6.2.1) no pixel lies farther from where it
+    was recorded than is told; slices that agree stay where they are."""
+    write_dicom(tmp_path / "cine", beside(asides_mm))
     stack = read_dicom_study(tmp_path / "cine")[0]
+    if told is None:
+        assert stack.remarks == ()
+    else:
+        (remark,) = stack.remarks
+        assert re.match(told, remark)
+    drawn_mm = np.array([(stack.cine.mr_from_index @ [0, 0, z, 1])[:3] for z in range(SLICES)])
+    recorded_mm = ORIGIN_MM + np.arange(SLICES)[:, None] * STEP_MM * NORMAL
+    recorded_mm = recorded_mm + np.array(asides_mm)[:, None] * ROW_AXIS
+    off_mm = np.linalg.norm(drawn_mm - recorded_mm, axis=1)
+    assert off_mm.max() < max(asides_mm) / 2 + 1e-6 or (off_mm > 1e-6).sum() == 1
+    axes = stack.cine.mr_from_index[:3, :3] / stack.cine.spacing_mm
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
     write_cine(tmp_path, stack)
     np.testing.assert_allclose(
         read_cine(tmp_path).mr_from_index, stack.cine.mr_from_index, atol=1e-4
     )
+
+
+@pytest.mark.parametrize(
+    ("asides_mm", "words"),
+    [
+        ((0, 0.5, 1, 1.5), "2 of 4 lie too far .* by 0.75 mm; 0.62 mm, 0.5 of a pixel, are allow"),
+        ((0, 0, 0.7, 0), "1 of 4 lie too far .* by 0.70 mm; .*cine.fill_gaps"),
+    ],
+)
+def test_slices_half_a_pixel_aside_are_refused(
+    tmp_path: Path, asides_mm: tuple[float, ...], words: str
+) -> None:
+    write_dicom(tmp_path / "cine", beside(asides_mm))
+    with pytest.raises(InputError, match=f"shifted sideways: {words}"):
+        read_dicom_study(tmp_path / "cine")

@@ -22,7 +22,7 @@ from pipeline.imaging.frames import (
 )
 from pipeline.imaging.left_out import LeftOut, describe, left_out_lines
 from pipeline.imaging.phases import common_phases
-from pipeline.imaging.spacing import MOST_TOLD, fill_gaps, regular_steps
+from pipeline.imaging.spacing import MOST_TOLD, fill_gaps, regular_places
 from pipeline.imaging.stack_choice import choose_stack, stacks_beside
 
 EVENLY = (
@@ -125,25 +125,27 @@ def stack_frames(
     lines = left_out_lines([*left_out, *others], where)
     try:
         _require_complete(slices, where)
-        step_mm, numbers = regular_steps(slices, where, fill)
+        places = regular_places(slices, where, fill)
     except InputError as error:
         # A slice that is missed may be there, and be none of the stack for a reason.
         raise InputError("; not taken: ".join([str(error), *lines])) from error
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
-    phases = common_phases(triggers, rr_ms, where, numbers.tolist())
-    mr_from_index = placement(slices[0][0], step_mm)
-    intensity, missing = fill_gaps(_intensity(slices), numbers)
+    phases = common_phases(triggers, rr_ms, where, places.numbers.tolist())
+    mr_from_index = placement(slices[0][0], places.step_mm)
+    mr_from_index[:3, 3] = places.origin_mm
+    intensity, missing = fill_gaps(_intensity(slices), places.numbers)
     cine = Cine(intensity, mr_from_index, phases, float(rr_ms.mean()) / 1000, missing)
     source = rr_source or f"DICOM {time_name} and RR interval"
     doubts = (
+        *places.remarks,
         *_doubts_of_place(chosen),
         *_doubts_of_rate(chosen),
         *_doubts_of_series(chosen),
         *stacks_beside(frames, chosen, where),
     )
     patient = next((frame.patient for frame in chosen if frame.patient), "")
-    timed = tuple(numbers.tolist()) if missing else ()
+    timed = tuple(places.numbers.tolist()) if missing else ()
     return Stack(cine, triggers, rr_ms, source, lines, timed, doubts, patient)
 
 

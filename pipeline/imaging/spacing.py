@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +15,10 @@ NEARLY_ONE, NEARLY_ONE_MM = 0.4, 4.0
 """A step of less than this share of the median one, and than this, is none: with slices missing the
 step may be half of the median or less."""
 
+MOST_ASIDE = 0.5
+"""Of a pixel: slices farther beside the line that they share would show a step in the wall that is
+none. Breath-holds differ by more, 0.6 to 2.2 mm (`pipeline.imaging.alignment.BREATH_MM`)."""
+
 MOST_TOLD = 16
 """Of repeated slices so many are told in one message: more than a stack usually has."""
 
@@ -21,10 +26,29 @@ WIDEST_GAP_MM = 25.0
 """Across a wider gap nothing is interpolated: an apex or a valve plane would fit in it."""
 
 
-def regular_steps(
-    slices: Sequence[Sequence[Frame]], where: str, fill: bool
-) -> tuple[Float, Integer]:
-    """The step of an evenly spaced stack, of which single slices may be missing.
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the slices of an evenly spaced stack lie."""
+
+    origin_mm: Float
+    """``(3,)`` LPS of the first slice's first pixel, on the line that all slices share."""
+
+    step_mm: Float
+    """``(3,)`` LPS from one slice to the next."""
+
+    numbers: Integer
+    """``(slice,)`` the place of each in the stack."""
+
+    remarks: tuple[str, ...] = ()
+    """What of the files' places is not kept, in words."""
+
+
+def regular_places(slices: Sequence[Sequence[Frame]], where: str, fill: bool) -> Places:
+    """The places of an evenly spaced stack, of which single slices may be missing.
+
+    Slices may lie `MOST_ASIDE` of a pixel beside the line that they share, as where scanners
+    round positions or a breath-hold is planned anew. They are drawn on that line, which is told:
+    it is less than one breath differs from another, which the heart's own outlines tell later.
 
     Parameters
     ----------
@@ -35,11 +59,6 @@ def regular_steps(
     fill
         Whether single slices may be missing.
 
-    Returns
-    -------
-    step_mm, numbers
-        ``(3,)`` LPS from one slice to the next, and ``(slice,)`` the place of each in the stack.
-
     Raises
     ------
     InputError
@@ -47,48 +66,78 @@ def regular_steps(
         may not be, else where a gap is wider than one slice or than `WIDEST_GAP_MM`.
     """
     positions_mm = np.array([one[0].position_mm for one in slices])
-    normal = slices[0][0].normal
-    lengths_mm = np.diff(positions_mm, axis=0) @ normal
+    first = slices[0][0]
+    lengths_mm = np.diff(positions_mm, axis=0) @ first.normal
     _require_no_second(slices, lengths_mm, where)
     usual_mm = float(lengths_mm.min())
     counts = np.maximum(np.rint(lengths_mm / usual_mm), 1).astype(int)
     numbers = np.concatenate([[0], np.cumsum(counts)])
     allowed_mm = max(0.1, 0.02 * usual_mm)
     _require_one_place(slices, allowed_mm, where)
-    step_mm = (positions_mm[-1] - positions_mm[0]) / numbers[-1]
-    away_mm = positions_mm - positions_mm[0] - numbers[:, None] * step_mm
-    _require_even(slices, away_mm, lengths_mm, allowed_mm, where)
-    # What positions of few decimals lean by; a grid has its axes at right angles.
-    upright_mm = (step_mm @ normal) * normal
-    aside_mm = float(np.linalg.norm(step_mm - upright_mm) * numbers[-1])
-    if aside_mm > allowed_mm:
-        raise InputError(
-            f"{where}: slices are shifted sideways, each beside the one before: from the first to "
-            f"the last by {aside_mm:.2f} mm, {allowed_mm:.2f} mm are allowed; resample the stack "
-            "to a grid with axes at right angles"
-        )
+    along_mm = (positions_mm - positions_mm[0]) @ first.normal
+    step_mm = along_mm[-1] / numbers[-1]
+    _require_even(slices, along_mm - numbers * step_mm, lengths_mm, allowed_mm, where)
+    # Those that agree keep their places, whichever slice was moved.
+    in_plane_mm = (positions_mm - positions_mm[0]) @ first.axes.T
+    line_mm = np.median(in_plane_mm, axis=0)
+    aside_mm = np.linalg.norm(in_plane_mm - line_mm, axis=1)
+    _require_above_one_another(slices, aside_mm, allowed_mm, where)
     _require_no_wide_gap(slices, lengths_mm, counts, fill, where)
-    return np.asarray(upright_mm), np.asarray(numbers, np.int64)
+    return Places(
+        positions_mm[0] + line_mm @ first.axes,
+        step_mm * first.normal,
+        np.asarray(numbers, np.int64),
+        _told_aside(numbers, aside_mm, allowed_mm),
+    )
 
 
 def _require_even(
     slices: Sequence[Sequence[Frame]],
-    away_mm: Float,
+    off_mm: Float,
     lengths_mm: Float,
     allowed_mm: float,
     where: str,
 ) -> None:
-    """Refuse slices that lie ``(slice, 3)`` away from their places in an even stack."""
-    off_mm = np.linalg.norm(away_mm, axis=1)
-    if off_mm.max() > allowed_mm:
-        worst = int(off_mm.argmax())
-        along_mm = abs(float(away_mm[worst] @ slices[0][0].normal))
+    """Refuse slices that lie ``(slice,)`` along the normal off their places in an even stack."""
+    worst = int(np.abs(off_mm).argmax())
+    if abs(off_mm[worst]) > allowed_mm:
         raise InputError(
             f"{where}: slices are not evenly spaced: {slices[worst][0].where} lies "
-            f"{off_mm[worst]:.2f} mm from its place in an even stack from the first to the last "
-            f"({along_mm:.2f} mm of it along the normal), {allowed_mm:.2f} mm are allowed; steps "
-            f"along the normal are {lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
+            f"{abs(off_mm[worst]):.2f} mm along the normal from its place in an even stack from "
+            f"the first to the last, {allowed_mm:.2f} mm are allowed; steps along the normal are "
+            f"{lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
         )
+
+
+def _require_above_one_another(
+    slices: Sequence[Sequence[Frame]], aside_mm: Float, rounded_mm: float, where: str
+) -> None:
+    """Refuse slices that lie ``(slice,)`` too far beside the line that they share."""
+    most_mm = max(rounded_mm, MOST_ASIDE * min(slices[0][0].spacing_mm))
+    worst = int(aside_mm.argmax())
+    if aside_mm[worst] > most_mm:
+        many = int((aside_mm > most_mm).sum())
+        raise InputError(
+            f"{where}: slices are shifted sideways: {many} of {len(slices)} lie too far beside the "
+            f"line along their normal on which most lie, {slices[worst][0].where} by "
+            f"{aside_mm[worst]:.2f} mm; {most_mm:.2f} mm, {MOST_ASIDE:g} of a pixel, are allowed. "
+            "Resample the stack to a grid with axes at right angles; a slice that was planned "
+            "elsewhere may be left out instead, with cine.fill_gaps: true inside the stack"
+        )
+
+
+def _told_aside(numbers: Integer, aside_mm: Float, rounded_mm: float) -> tuple[str, ...]:
+    """A sentence where slices lie ``(slice,)`` beside the line on which they are drawn, by more
+    than positions of few decimals do."""
+    many = int((aside_mm > rounded_mm).sum())
+    if not many:
+        return ()
+    worst = int(aside_mm.argmax())
+    return (
+        f"{many} of {len(aside_mm)} slices lie up to {aside_mm[worst]:.2f} mm (slice "
+        f"{numbers[worst]}), less than a pixel, beside the line along their normal on which all "
+        "are drawn; as after a breath, the heart's outlines alone bring them together again",
+    )
 
 
 def _require_no_wide_gap(
