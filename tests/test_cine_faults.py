@@ -24,6 +24,7 @@ from pipeline.imaging.faults import (
     require_finite,
     require_room_for_a_heart,
     without_blank_ends,
+    without_unrecorded,
 )
 from pipeline.imaging.frames import Frame
 from pipeline.imaging.nifti import read_nifti_cine
@@ -125,6 +126,49 @@ def test_values_that_are_no_numbers_are_named_by_place(value: float) -> None:
     cine.intensity[2, 4, 1, 1] = value
     with pytest.raises(InputError, match=r"here, phase 2, slice 4: grey values must be finite"):
         require_finite(cine, "here")
+
+
+def test_nan_about_what_was_recorded_is_dark_and_told() -> None:
+    """A disc of measurements, as of a field of view that was turned: what is in it stays."""
+    cine = noisy(phases=3, slices=4)
+    cine.intensity[1, 2, 3, 3] = -7.5
+    y, x = np.mgrid[:6, :7]
+    outside = np.hypot(x - 3, y - 2.5) > 3
+    spoilt = replace(cine, intensity=np.where(outside, np.nan, cine.intensity))
+    found, (remark,) = without_unrecorded(spoilt, "the cine")
+    np.testing.assert_array_equal(found.intensity, np.where(outside, -7.5, cine.intensity))
+    require_finite(found, "here")
+    assert np.isnan(spoilt.intensity).any()
+    assert f"{outside.mean():.1%} of the pixels, at the edge of 4 of 4 slices" in remark
+    assert remark.endswith("the darkest value, -7.5")
+    assert without_unrecorded(cine, "the cine") == (cine, ())
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (np.s_[:, 2, 2:4, 2:4], r"phase 0, slice 2: .* in 4 pixels, the first in row 2, column 2"),
+        (np.s_[1, 2, :2, :2], r"phase 1, slice 2: .* the first in row 0, column 0"),
+        (np.s_[:, 2], r"phase 0, slice 2: .* in 42 pixels"),
+    ],
+    ids=["inside", "one phase", "a whole slice"],
+)
+def test_other_nan_is_refused_with_its_place(place: Any, words: str) -> None:
+    cine = noisy()
+    cine.intensity[place] = np.nan
+    cine.intensity[:, :, -1] = np.nan
+    found, _ = without_unrecorded(cine, "the cine")
+    with pytest.raises(InputError, match=f"here, {words}"):
+        require_finite(found, "here")
+
+
+def test_slices_of_nan_at_the_ends_are_left_out_as_blank_ones_are() -> None:
+    cine = noisy(slices=6)
+    cine.intensity[:, [0, 5]] = np.nan
+    found, _ = without_unrecorded(cine, "the cine")
+    times_ms = np.tile(np.arange(4) * 200.0, (6, 1))
+    left = without_blank_ends(Stack(found, times_ms, np.full(6, 800.0), "files", ()))
+    np.testing.assert_array_equal(left.cine.intensity, cine.intensity[:, 1:5])
 
 
 def beating_ball(phases: int = 20, slices: int = 12) -> Cine:

@@ -114,7 +114,7 @@ def without_padding(stored: Any, dataset: Any) -> Any:
     for turn in (-bits, 0, bits):
         padding |= (stored >= low + turn) & (stored <= high + turn)
     if padding.any():
-        padding = np.stack([_at_the_edge(one) for one in padding])
+        padding = np.stack([at_the_edge(one) for one in padding])
     if not padding.any() or padding.all():
         return stored
     dark = stored[~padding].max() if _is_white_for_black(dataset) else stored[~padding].min()
@@ -129,7 +129,7 @@ def whole_number(value: Any) -> int | None:
         return None
 
 
-def _at_the_edge(mask: Any) -> Any:
+def at_the_edge(mask: Any) -> Any:
     """The parts of a mask ``(row, column)`` that touch the edge of the image."""
     parts, _ = label(mask)
     edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))

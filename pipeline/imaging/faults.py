@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.dicom_pixels import at_the_edge
 from pipeline.imaging.frames import MIN_SLICES
 from pipeline.imaging.spacing import WIDEST_GAP_MM
 
@@ -45,10 +46,43 @@ def require_finite(cine: Cine, where: str) -> None:
     bad = ~np.isfinite(cine.intensity).all(axis=(2, 3))
     if bad.any():
         phase, number = np.argwhere(bad)[0]
+        wrong = np.argwhere(~np.isfinite(cine.intensity[phase, number]))
+        row, column = wrong[0]
         raise InputError(
             f"{where}, phase {phase}, slice {number}: grey values must be finite numbers, got NaN "
-            "or infinity; export the images again"
+            f"or infinity in {len(wrong)} pixels, the first in row {row}, column {column} (such "
+            f"values in {int(bad.sum())} of {bad.size} images); export the images again. NaN is "
+            "taken for what was not recorded only where it reaches the image's edge and is the "
+            "same in all phases"
         )
+
+
+def without_unrecorded(cine: Cine, where: str) -> tuple[Cine, tuple[str, ...]]:
+    """The cine with its darkest value in place of NaN about what was recorded, and a remark.
+
+    Programs that turn or cut images fill up with NaN. Such pixels are those that are NaN in all
+    phases and reach the image's edge. What else is NaN stays so.
+    """
+    nan = np.isnan(cine.intensity)
+    if not nan.any():
+        return cine, ()
+    always = nan.all(axis=0)
+    shown = np.flatnonzero(~always.all(axis=(1, 2)))
+    around = np.stack([at_the_edge(one) for one in always])
+    # A whole slice between others is lost, not beyond what was recorded.
+    whole = always.all(axis=(1, 2))
+    around[[k for k in np.flatnonzero(whole) if len(shown) and shown[0] < k < shown[-1]]] = False
+    finite = cine.intensity[np.isfinite(cine.intensity)]
+    if not around.any() or not finite.size:
+        return cine, ()
+    dark = finite.min()
+    intensity = np.where(around & nan, dark, cine.intensity)
+    many, slices = float(around.mean()), int(around.any(axis=(1, 2)).sum())
+    remark = (
+        f"{where}: {many:.1%} of the pixels, at the edge of {slices} of {len(around)} slices, are "
+        f"NaN in all phases: not recorded, and read as the darkest value, {dark:g}"
+    )
+    return replace(cine, intensity=intensity), (remark,)
 
 
 def require_room_for_a_heart(cine: Cine, where: str) -> None:

@@ -18,7 +18,9 @@ from pipeline.imaging.faults import (
     require_different_images,
     require_finite,
     without_blank_ends,
+    without_unrecorded,
 )
+from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.imaging.phases import doubts_of_phases
 from pipeline.job import Job
@@ -47,11 +49,12 @@ def run(job: Job) -> dict[str, Any]:
         views = read_nifti_views(job.study.long_axis, files.rr_ms)
     where = f"{job.study.folder / 'study.yaml'}: cine.spoilt_slices"
     stack = replace(stack, cine=redraw_slices(stack.cine, files.spoilt_slices, where))
+    cine, unrecorded = without_unrecorded(stack.cine, "the cine")
+    stack = replace(stack, cine=cine, remarks=(*stack.remarks, *unrecorded))
     require_finite(stack.cine, str(files.path))
     stack = without_blank_ends(stack)
     copies = require_different_images(stack.cine, str(files.path))
-    for view in views:
-        require_finite(view.cine, f"long-axis view {view.name}")
+    views, told_of_views = _views_of_numbers(views)
     ecg = None if job.study.ecg.mr is None else read_ecg(job.study.ecg.mr)
     _require_ecg_as_long(job, stack, ecg)
     write_cine(job.folder, stack, views)
@@ -67,6 +70,7 @@ def run(job: Job) -> dict[str, Any]:
         "left_out": list(stack.left_out),
         "remarks": [
             *stack.remarks,
+            *told_of_views,
             *copies,
             *doubts_of_order(stack.cine),
             *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, _timed(stack)),
@@ -76,6 +80,19 @@ def run(job: Job) -> dict[str, Any]:
         "patient_mark": patient_mark(stack.patient),
         "long_axis": [view.name for view in views],
     }
+
+
+def _views_of_numbers(views: Sequence[LongAxis]) -> tuple[tuple[LongAxis, ...], list[str]]:
+    """Long-axis views without NaN about what was recorded, and what is told of them."""
+    kept: list[LongAxis] = []
+    told: list[str] = []
+    for view in views:
+        where = f"long-axis view {view.name}"
+        cine, unrecorded = without_unrecorded(view.cine, where)
+        require_finite(cine, where)
+        kept.append(replace(view, cine=cine))
+        told += unrecorded
+    return tuple(kept), told
 
 
 def _doubts_of_beat(job: Job, stack: Stack, ecg: Ecg | None) -> list[str]:
