@@ -23,6 +23,7 @@ from pipeline.imaging.faults import (
     require_different_images,
     require_finite,
     require_room_for_a_heart,
+    require_slices_before_phases,
     without_blank_ends,
     without_unrecorded,
 )
@@ -31,6 +32,7 @@ from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.phases import common_phases, doubts_of_phases
 from pipeline.imaging.stack_choice import choose_stack
 from pipeline.study import open_study
+from tests.outside_heart import Scan, render
 
 STEP_8_MM = np.diag([1.4, 1.4, 8.0, 1.0])
 
@@ -278,6 +280,50 @@ def test_images_too_small_for_a_heart_are_refused() -> None:
     small = replace(cine, mr_from_index=np.diag([0.14, 0.14, 0.8, 1.0]))
     with pytest.raises(InputError, match=r"here: its images measure 9 x 9 mm.*in centimetres\?"):
         require_room_for_a_heart(small, "here")
+
+
+@pytest.mark.parametrize(
+    ("slices", "step_mm", "fits"),
+    [(10, 1.0, False), (12, 1.5, False), (3, 5.0, True), (12, 2.5, True), (30, 1.0, True)],
+)
+def test_a_stack_whose_header_lost_the_distance_of_its_slices_is_refused(
+    slices: int, step_mm: float, fits: bool
+) -> None:
+    """Few slices of a usual distance, and thin ones that reach over a heart, are what they are."""
+    pixels = np.zeros((2, slices, 64, 64), np.float32)
+    cine = Cine(pixels, np.diag([1.5, 1.5, step_mm, 1.0]), np.arange(2) / 2, 0.8)
+    if fits:
+        require_room_for_a_heart(cine, "here")
+        return
+    words = rf"here: its {slices} slices lie {step_mm:g} mm apart .*write the affine"
+    with pytest.raises(InputError, match=words):
+        require_room_for_a_heart(cine, "here")
+
+
+@pytest.mark.parametrize("phases", [6, 14])
+def test_slices_and_phases_that_are_exchanged_are_refused(phases: int) -> None:
+    """Of a chest by another renderer, through a whole beat and through most of one."""
+    for covered in (1.0, 0.7):
+        moments = tuple(covered * np.arange(phases) / phases)
+        scan = Scan(moments, slices=6, step_mm=12.0, pixel_mm=3.0, depths=1)
+        cine = render(phases, scan).cine
+        require_slices_before_phases(cine, "here")
+        exchanged = replace(
+            cine,
+            intensity=np.ascontiguousarray(cine.intensity.swapaxes(0, 1)),
+            phases=np.arange(6) / 6,
+        )
+        words = rf"here: its axes of .* its {phases} slices are alike .* its 6 phases .*swapaxes"
+        with pytest.raises(InputError, match=words):
+            require_slices_before_phases(exchanged, "here")
+
+
+def test_thin_slices_of_two_phases_far_apart_are_not_taken_for_exchanged() -> None:
+    """Neighbouring slices of a volume are more alike than end-diastole and end-systole."""
+    whole = beating_ball(phases=20, slices=12)
+    fine = np.repeat(whole.intensity[[0, 10, 11]], 8, axis=1)
+    require_slices_before_phases(replace(whole, intensity=fine, phases=whole.phases[:3]), "here")
+    require_slices_before_phases(whole, "here")
 
 
 def test_a_damaged_file_is_named_with_what_to_do(tmp_path: Path) -> None:

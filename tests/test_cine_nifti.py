@@ -188,6 +188,9 @@ def test_voxels_that_lost_their_size_are_told(tmp_path: Path) -> None:
     nifti_cine(path, np.eye(4))
     (remark,) = read_nifti_cine(path, None).remarks
     assert "voxels of 1 x 1 x 1 mm, so of a heart in 4 mm" in remark
+    nifti_cine(path, np.diag([1.5, 1.5, 1, 1]))
+    (remark,) = read_nifti_cine(path, None).remarks
+    assert "voxels of 1.5 x 1.5 x 1 mm, so of a heart in 4 mm" in remark
     # Whole hearts in cubes of 1 mm, and flat voxels, are what they are.
     for affine, slices in ((np.eye(4), 70), (np.diag([1, 1, 8, 1]), 4)):
         image = nibabel.Nifti1Image(np.zeros((40, 40, slices, 5), np.int16), affine)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float, Float32, Integer
+from pipeline.geometry import Float, Float32, Integer, Mask
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.dicom_pixels import at_the_edge
 from pipeline.imaging.frames import MIN_SLICES
@@ -40,6 +40,16 @@ ORDER_PIXELS = 64
 LEAST_VIEW_MM = 60.0
 """Sides of images that show a left ventricle with its wall."""
 
+LEAST_HEIGHT_MM, THIN_MM = 30.0, 2.5
+"""A stack of slices thinner than the second, as those of volumes are, holds no ventricle in less
+than the first: such is what is left of one whose header lost the distance of its slices."""
+
+EXCHANGED, COMES_ROUND = 2.0, 1.5
+"""Times by which neighbours are less alike than along the other axis, and the last is less like the
+first than neighbours are, where an axis of phases is one of slices. In 6 stacks of 6 to 25 phases
+and 6 to 23 slices, 5 to 12 mm apart, phases were more alike than slices 6 to 60 times; the last
+phase was as like the first as neighbours or more, and the last slice 2 to 8 times less."""
+
 
 def require_finite(cine: Cine, where: str) -> None:
     """Raise InputError unless all grey values are numbers."""
@@ -66,11 +76,11 @@ def without_unrecorded(cine: Cine, where: str) -> tuple[Cine, tuple[str, ...]]:
     nan = np.isnan(cine.intensity)
     if not nan.any():
         return cine, ()
-    always = nan.all(axis=0)
-    shown = np.flatnonzero(~always.all(axis=(1, 2)))
-    around = np.stack([at_the_edge(one) for one in always])
+    always: Mask = np.asarray(nan.all(axis=0))
+    around: Mask = np.stack([at_the_edge(one) for one in always])
     # A whole slice between others is lost, not beyond what was recorded.
-    whole = always.all(axis=(1, 2))
+    whole: Mask = np.asarray(always.all(axis=(1, 2)))
+    shown = np.flatnonzero(~whole)
     around[[k for k in np.flatnonzero(whole) if len(shown) and shown[0] < k < shown[-1]]] = False
     finite = cine.intensity[np.isfinite(cine.intensity)]
     if not around.any() or not finite.size:
@@ -95,6 +105,49 @@ def require_room_for_a_heart(cine: Cine, where: str) -> None:
             f"least {LEAST_VIEW_MM:g} mm are needed; are lengths in centimetres? Write them in "
             "millimetres"
         )
+    step_mm, slices = float(cine.spacing_mm[2]), cine.intensity.shape[1]
+    if step_mm < THIN_MM and slices * step_mm < LEAST_HEIGHT_MM:
+        raise InputError(
+            f"{where}: its {slices} slices lie {step_mm:.3g} mm apart and reach over "
+            f"{slices * step_mm:.3g} mm, too little for a heart: at least {LEAST_HEIGHT_MM:g} mm "
+            "are needed of slices so thin. A program that saves an array alone loses the distance "
+            "of its slices, 5 to 10 mm in most cines: write the affine of the images that these "
+            "were made of, or convert the scanner's own files again"
+        )
+
+
+def require_slices_before_phases(cine: Cine, where: str) -> None:
+    """Raise InputError where the axes of slices and phases are exchanged, by the images alone.
+
+    Phases come round, so that the last is much like the first, and neighbours are nearly the same;
+    slices of a stack are neither.
+    """
+    if min(cine.intensity.shape[:2]) < MIN_SLICES:
+        return
+    images = _small(cine)
+    images -= images.mean(axis=2, keepdims=True)
+    images /= np.maximum(np.linalg.norm(images, axis=2, keepdims=True), 1e-9)
+    by_phase, by_slice = (_unlike_next(np.moveaxis(images, axis, 0)) for axis in (0, 1))
+    phases, slices = (float(one[:-1].mean()) for one in (by_phase, by_slice))
+    if (
+        phases > EXCHANGED * slices
+        and by_phase[-1] > COMES_ROUND * phases
+        and by_slice[-1] < COMES_ROUND * slices
+    ):
+        count = cine.intensity.shape
+        raise InputError(
+            f"{where}: its axes of slices and phases look exchanged: its {count[1]} slices are "
+            f"alike and come round as phases do, its {count[0]} phases differ as slices; store it "
+            "as (columns, rows, slices, phases): of an array in Python data.swapaxes(2, 3), with "
+            "the distance of the slices in the affine"
+        )
+
+
+def _unlike_next(images: Float32) -> Float:
+    """How unlike ``(n,)`` images ``(n, other, pixel)`` of length 1 are to the next, the last to
+    the first, on average."""
+    following = np.roll(images, -1, axis=0)
+    return np.asarray(1 - np.einsum("aip,aip->a", images, following) / images.shape[1], float)
 
 
 def redraw_slices(cine: Cine, spoilt: Sequence[int], where: str) -> Cine:

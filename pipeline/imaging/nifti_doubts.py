@@ -24,14 +24,15 @@ LEAST_HEIGHT_MM = 60
 
 
 def doubts_of_size(edges_mm: Float, slices: int) -> tuple[str, ...]:
-    """What speaks against the size of the voxels, in words: cubes of 1 mm are what arrays become
-    that are saved without a header."""
-    if slices >= LEAST_HEIGHT_MM or not np.allclose(edges_mm, 1, atol=1e-6):
+    """What speaks against the size of the voxels, in words: slices 1 mm apart are what becomes of
+    arrays that are saved without a header, or with that of a single slice."""
+    if slices >= LEAST_HEIGHT_MM or not np.isclose(edges_mm[2], 1, atol=1e-6):
         return ()
     return (
-        f"the NIfTI header tells of voxels of 1 x 1 x 1 mm, so of a heart in {slices} mm, as "
-        "programs do that save an array alone; pixels of a cine are 1 to 2 mm wide, and its slices "
-        "5 to 10 mm apart: if so here, write the affine of the images that these were made of",
+        f"the NIfTI header tells of voxels of {' x '.join(f'{edge:.4g}' for edge in edges_mm)} mm, "
+        f"so of a heart in {slices} mm, as programs do that save an array alone; pixels of a cine "
+        "are 1 to 2 mm wide, and its slices 5 to 10 mm apart: if so here, write the affine of the "
+        "images that these were made of",
     )
 
 

@@ -17,6 +17,7 @@ from pipeline.imaging.faults import (
     redraw_slices,
     require_different_images,
     require_finite,
+    require_slices_before_phases,
     without_blank_ends,
     without_unrecorded,
 )
@@ -52,6 +53,8 @@ def run(job: Job) -> dict[str, Any]:
     cine, unrecorded = without_unrecorded(stack.cine, "the cine")
     stack = replace(stack, cine=cine, remarks=(*stack.remarks, *unrecorded))
     require_finite(stack.cine, str(files.path))
+    if not files.path.is_dir():
+        require_slices_before_phases(stack.cine, str(files.path))
     stack = without_blank_ends(stack)
     copies = require_different_images(stack.cine, str(files.path))
     views, told_of_views = _views_of_numbers(views)
