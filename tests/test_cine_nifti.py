@@ -317,6 +317,26 @@ def test_a_given_rr_interval_is_that_of_untimed_long_axis_views_too(
     np.testing.assert_allclose(timed.phases, [0, 0.2, 0.5, 0.9])
 
 
+@pytest.mark.parametrize(
+    ("unit", "step", "told"), [("unknown", 0.2, True), ("unknown", 200, True), ("sec", 0.2, False)]
+)
+def test_a_views_time_step_without_a_unit_is_told_as_the_cines_is(
+    tmp_path: Path, unit: str, step: float, told: bool
+) -> None:
+    image = nibabel.Nifti1Image(np.ones((8, 6, 1, 4), np.int16), np.diag([1, 1, 8, 1.0]))
+    image.header.set_xyzt_units("mm", unit)
+    image.header["pixdim"][4] = step
+    nibabel.save(image, tmp_path / "four_chamber.nii.gz")
+    (view,) = read_nifti_views(tmp_path)
+    assert view.cine.rr_s == pytest.approx(0.8)
+    words = (
+        f"the NIfTI header's time step of {step:g} has no unit; as 200 ms it makes a beat of 800"
+    )
+    assert [one.startswith(words) for one in view.remarks] == [True] * told
+    # Who gives the RR interval needs no word.
+    assert read_nifti_views(tmp_path, rr_ms=800)[0].remarks == ()
+
+
 @pytest.mark.parametrize("name", ["four_chamber.json", "2ch_timing.json", "IM0001"])
 def test_what_is_no_long_axis_view_nor_its_timing_is_named(tmp_path: Path, name: str) -> None:
     image = nibabel.Nifti1Image(np.ones((8, 6, 1, 4), np.int16), np.diag([1, 1, 8, 1.0]))

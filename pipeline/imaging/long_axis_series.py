@@ -35,6 +35,9 @@ class LongAxis:
     cine: Cine
     """One slice; its phases are those of its own trigger times and RR interval."""
 
+    remarks: tuple[str, ...] = ()
+    """What its file leaves open, and a person must know before the products are used."""
+
 
 def long_axis_views(
     frames: Iterable[Frame], stack: Cine

@@ -221,11 +221,13 @@ def _read_view(path: Path, rr_ms: float | None) -> LongAxis:
     intensity, mr_from_index = read_image(path)
     timing = _view_timing(path)
     own = timing if timing.exists() else None
-    triggers, own_rr_ms, _ = _timing(image, path, own, None if own else rr_ms)
+    triggers, own_rr_ms, source = _timing(image, path, own, None if own else rr_ms)
     phases = common_phases(triggers, own_rr_ms, str(own or path))
     pixels = np.ascontiguousarray(intensity, np.float32)
     return LongAxis(
-        _view_name(path), Cine(pixels, mr_from_index, phases, float(own_rr_ms[0]) / 1000)
+        _view_name(path),
+        Cine(pixels, mr_from_index, phases, float(own_rr_ms[0]) / 1000),
+        _doubts_of_header_step(image, path) if source == HEADER_STEP else (),
     )
 
 

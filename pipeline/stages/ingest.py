@@ -86,7 +86,7 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def _views_of_numbers(views: Sequence[LongAxis]) -> tuple[tuple[LongAxis, ...], list[str]]:
-    """Long-axis views without NaN about what was recorded, and what is told of them."""
+    """Long-axis views without NaN about what was recorded, and what is told of them and that."""
     kept: list[LongAxis] = []
     told: list[str] = []
     for view in views:
@@ -94,7 +94,7 @@ def _views_of_numbers(views: Sequence[LongAxis]) -> tuple[tuple[LongAxis, ...], 
         cine, unrecorded = without_unrecorded(view.cine, where)
         require_finite(cine, where)
         kept.append(replace(view, cine=cine))
-        told += unrecorded
+        told += [*(f"{where}: {remark}" for remark in view.remarks), *unrecorded]
     return tuple(kept), told
 
 
