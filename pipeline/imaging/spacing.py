@@ -135,7 +135,7 @@ def _told_aside(numbers: Integer, aside_mm: Float, rounded_mm: float) -> tuple[s
     worst = int(aside_mm.argmax())
     return (
         f"{many} of {len(aside_mm)} slices lie up to {aside_mm[worst]:.2f} mm (slice "
-        f"{numbers[worst]}), less than a pixel, beside the line along their normal on which all "
+        f"{numbers[worst]}), half a pixel at most, beside the line along their normal on which all "
         "are drawn; as after a breath, the heart's outlines alone bring them together again",
     )
 
