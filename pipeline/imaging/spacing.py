@@ -48,7 +48,7 @@ def regular_places(slices: Sequence[Sequence[Frame]], where: str, fill: bool) ->
 
     Slices may lie `MOST_ASIDE` of a pixel beside the line that they share, as where scanners
     round positions or a breath-hold is planned anew. They are drawn on that line, which is told:
-    it is less than one breath differs from another, which the heart's own outlines tell later.
+    it is less than breaths differ by, and what is found of those takes most of it out.
 
     Parameters
     ----------
@@ -136,7 +136,8 @@ def _told_aside(numbers: Integer, aside_mm: Float, rounded_mm: float) -> tuple[s
     return (
         f"{many} of {len(aside_mm)} slices lie up to {aside_mm[worst]:.2f} mm (slice "
         f"{numbers[worst]}), half a pixel at most, beside the line along their normal on which all "
-        "are drawn; as after a breath, the heart's outlines alone bring them together again",
+        "are drawn; of slices 4 mm apart or more, what outlines tell of breath-holds takes most of "
+        "it out again",
     )
 
 
