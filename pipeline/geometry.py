@@ -43,6 +43,25 @@ def corners_apart_mm(mr_from_one: Float, mr_from_other: Float, counts: Sequence[
     return float(np.linalg.norm(corners @ moved[:, :3].T + moved[:, 3], axis=1).max())
 
 
+def rigid_between(target: Float, source: Float) -> Float:
+    """The rigid motion (4x4) that brings ``(n, 3)`` points nearest to their partners.
+
+    Least squares, without mirroring: S. Umeyama, "Least-squares estimation of transformation
+    parameters between two point patterns", IEEE Trans Pattern Anal 13 (1991) 376-380.
+
+    >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> rigid_between(corner + (1, 2, 3), corner)[:3, 3].round(6)
+    array([1., 2., 3.])
+    """
+    from_target, from_source = target - target.mean(axis=0), source - source.mean(axis=0)
+    left, _, right = np.linalg.svd(from_target.T @ from_source)
+    unmirrored = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    found = np.eye(4)
+    found[:3, :3] = left @ unmirrored @ right
+    found[:3, 3] = target.mean(axis=0) - found[:3, :3] @ source.mean(axis=0)
+    return found
+
+
 _ROUNDED = 0.02
 """Axes of numbers with two decimals miss length 1 and right angles by less."""
 

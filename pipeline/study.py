@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator
 
 from pipeline.errors import InputError
-from pipeline.geometry import require_rigid
+from pipeline.geometry import Float, require_rigid, rigid_between, transform_points
 from pipeline.regular_files import require_no_device, require_text_name
 from pipeline.sealing import sha256_of
 from pipeline.study_files import files_below, record_files, require_signals, sweep_files
@@ -35,6 +35,14 @@ from pipeline.yaml_files import read_yaml
 PATIENT_ID = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Place = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+# Root mean square distance from their common line that tells the turn about it, to some 20 degrees
+# by landmarks that are some millimetres off, as those of a beating heart are.
+_LEAST_WIDTH_MM = 10.0
+# Root mean square by which landmarks may miss each other: beyond it the start is no better than
+# none, and they were exchanged, mirrored, or given in another unit.
+_MOST_MISSED_MM = 15.0
 
 
 class CineFiles(Section):
@@ -63,11 +71,21 @@ class EcgFiles(Section):
     us: Path | None = None
 
 
+class Landmark(Section):
+    """A point that was found in the MR and touched or seen with the tracker, mm."""
+
+    mr_mm: Place
+    tracker_mm: Place
+
+
 class UltrasoundFiles(Section):
     """Tracked sweeps, and the first guess of where the tracker stands."""
 
     sweeps: tuple[Path, ...] = Field(min_length=1)
     initial_mr_from_tracker: list[Row] | None = Field(None, min_length=4, max_length=4)
+    landmarks: tuple[Landmark, ...] | None = Field(None, min_length=3)
+    """In place of that transform: three or more, which it brings nearest to each other."""
+
     probe_from_image: list[Row] | None = Field(None, min_length=4, max_length=4)
     """Calibration in place of the files' ImageToProbe: from pixels to the probe's marker, mm."""
 
@@ -80,6 +98,19 @@ class UltrasoundFiles(Section):
         if name is not None and not re.fullmatch("[A-Za-z][A-Za-z0-9]*", name):
             raise ValueError("needs letters and digits alone, a letter first, as Reference has")
         return name
+
+    def start(self) -> Float | None:
+        """Where the tracker roughly stands, ``mr_from_tracker``; None where nothing tells it."""
+        if self.landmarks is not None:
+            return rigid_between(*_places(self.landmarks))
+        given = self.initial_mr_from_tracker
+        return None if given is None else np.array(given, dtype=float)
+
+
+def _places(landmarks: Sequence[Landmark]) -> tuple[Float, Float]:
+    """In the MR and in the tracker's frame, ``(n, 3)`` each."""
+    in_mr = np.array([one.mr_mm for one in landmarks], dtype=float)
+    return in_mr, np.array([one.tracker_mm for one in landmarks], dtype=float)
 
 
 class Described(Section):
@@ -325,6 +356,32 @@ def _require_files(study: Study) -> None:
     if study.us and study.us.initial_mr_from_tracker:
         start = np.array(study.us.initial_mr_from_tracker, dtype=float)
         require_rigid(start, f"{study.folder}/study.yaml: us.initial_mr_from_tracker")
+    if study.us and study.us.landmarks:
+        _require_start(study.us, study.us.landmarks, f"{study.folder}/study.yaml: us.landmarks")
+
+
+def _require_start(us: UltrasoundFiles, landmarks: Sequence[Landmark], where: str) -> None:
+    """Refuse landmarks that tell no start."""
+    if us.initial_mr_from_tracker:
+        raise InputError(f"{where}: tell the same as us.initial_mr_from_tracker; take one out")
+    in_mr, in_tracker = _places(landmarks)
+    for name, places in (("mr_mm", in_mr), ("tracker_mm", in_tracker)):
+        widths = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if (width_mm := float(np.hypot(*widths[1:3])) / len(places) ** 0.5) < _LEAST_WIDTH_MM:
+            raise InputError(
+                f"{where}: by {name} they lie {width_mm:.1f} mm beside a common line, root mean "
+                f"square, which leaves the turn about it open; {_LEAST_WIDTH_MM:g} mm are needed: "
+                "add one that lies far beside it"
+            )
+    missed = in_mr - transform_points(rigid_between(in_mr, in_tracker), in_tracker)
+    apart_mm = np.linalg.norm(missed, axis=1)
+    if (mean_mm := float(np.sqrt((apart_mm**2).mean()))) > _MOST_MISSED_MM:
+        raise InputError(
+            f"{where}: no rigid motion brings them together: they miss each other by {mean_mm:.0f} "
+            f"mm, root mean square ({', '.join(f'{one:.0f}' for one in apart_mm)} mm), and "
+            f"{_MOST_MISSED_MM:g} are allowed; are all in millimetres, and does each mr_mm stand "
+            "beside the tracker_mm of the same point?"
+        )
 
 
 def _require_what_fits_the_cine(study: Study) -> None:

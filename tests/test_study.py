@@ -8,9 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
+from pipeline.geometry import Float
 from pipeline.study import EcgFiles, open_study
 from pipeline.study_files import files_below
 
@@ -89,6 +92,70 @@ def test_study_yaml_overrides_only_the_keys_it_gives(tmp_path: Path) -> None:
     (folder / "study.yaml").write_text("ecg: {mr: other}\n")
     assert open_study(folder).ecg.mr == folder / "other"
     assert open_study(folder).ecg.us == folder / "ecg" / "us"
+
+
+# Of no plane, some 40 mm about their middle, as apex, valves and the insertions of a ventricle.
+TOUCHED_MM = np.array([[40.0, 0, 10], [-30, 25, 0], [-20, -35, 5], [0, 10, -45]])
+
+
+def study_with_landmarks(root: Path, in_mr: Float, in_tracker: Float, more: str = "") -> Path:
+    folder = study_folder(root)
+    pairs = zip(in_mr.tolist(), in_tracker.tolist(), strict=True)
+    told = [{"mr_mm": one, "tracker_mm": other} for one, other in pairs]
+    (folder / "study.yaml").write_text(f"us: {{landmarks: {told}{more}}}\n")
+    return folder
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_landmarks_tell_where_the_tracker_stands(tmp_path: Path, count: int) -> None:
+    truth = Rotation.from_rotvec([100, -70, 150], degrees=True)
+    in_tracker = TOUCHED_MM[:count]
+    in_mr = np.array([150, -40, 300]) + truth.apply(in_tracker)
+    study = open_study(study_with_landmarks(tmp_path, in_mr, in_tracker))
+    assert study.us is not None
+    start = study.us.start()
+    assert start is not None
+    np.testing.assert_allclose(start[:3, :3], truth.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(start[:3, 3], (150, -40, 300), atol=1e-6)
+    assert np.array_equal(start[3], (0, 0, 0, 1))
+
+
+def test_landmarks_some_millimetres_off_are_a_start_within_capture(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    truth = Rotation.from_rotvec([20, 160, -30], degrees=True)
+    in_mr = truth.apply(TOUCHED_MM) + rng.normal(scale=5, size=TOUCHED_MM.shape)
+    study = open_study(study_with_landmarks(tmp_path, in_mr, TOUCHED_MM))
+    assert study.us is not None
+    start = study.us.start()
+    assert start is not None
+    # By another solver, which is given the same points about their middle.
+    turn, _ = Rotation.align_vectors(in_mr - in_mr.mean(0), TOUCHED_MM - TOUCHED_MM.mean(0))
+    np.testing.assert_allclose(start[:3, :3], turn.as_matrix(), atol=1e-9)
+    assert np.degrees((turn * truth.inv()).magnitude()) < 20
+    assert np.linalg.norm(start[:3, 3]) < 20
+
+
+@pytest.mark.parametrize(
+    ("in_mr", "in_tracker", "more", "words"),
+    [
+        (TOUCHED_MM[:2], TOUCHED_MM[:2], "", r"us\.landmarks"),
+        (TOUCHED_MM * (1, 0, 0), TOUCHED_MM * (1, 0, 0), "", "by mr_mm they lie 0.0 mm beside"),
+        (TOUCHED_MM, TOUCHED_MM * (1, 0.1, 0.1), "", "by tracker_mm they lie"),
+        (TOUCHED_MM, TOUCHED_MM[[1, 0, 2, 3]], "", "no rigid motion brings them together"),
+        (TOUCHED_MM, TOUCHED_MM * (1, -1, 1), "", "no rigid motion brings them together"),
+        (TOUCHED_MM, TOUCHED_MM * 10, "", "are all in millimetres"),
+        (TOUCHED_MM * np.nan, TOUCHED_MM, "", "finite number"),
+        (TOUCHED_MM, TOUCHED_MM, f", initial_mr_from_tracker: {np.eye(4).tolist()}", "take one"),
+    ],
+)
+def test_landmarks_that_tell_no_start_are_refused(
+    tmp_path: Path, in_mr: Float, in_tracker: Float, more: str, words: str
+) -> None:
+    folder = study_with_landmarks(tmp_path, in_mr, in_tracker, more)
+    text = (folder / "study.yaml").read_text().replace("nan", ".nan")
+    (folder / "study.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        open_study(folder)
 
 
 @pytest.mark.parametrize("name", ["mr.edf", "mr.dat"])

@@ -17,9 +17,13 @@ from pipeline.registration.settings import RegisterSettings
 LEAST_IN_VIEW = 0.05
 """A frame with less of its picture in blood or at its walls has too little to compare."""
 
-_INVERTED = "by its inverse they do: is initial_mr_from_tracker given the other way round?"
+_INVERTED = (
+    "by its inverse they do: is the start (us.initial_mr_from_tracker, us.landmarks) given "
+    "the other way round?"
+)
 _MISPLACED = (
-    "is initial_mr_from_tracker right? look at directions (each name tells its own: tracker to MR, "
+    "is the start (us.initial_mr_from_tracker, us.landmarks) right? look at directions (each name "
+    "tells its own: tracker to MR, "
     "ProbeToTracker, ImageToProbe), calibration, units (mm) and axes (LPS; 3D Slicer shows RAS)"
 )
 

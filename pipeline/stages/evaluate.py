@@ -198,10 +198,10 @@ def _registration(job: Job, truth: Path, known: dict[str, Any]) -> dict[str, Any
     heart = read_mesh(truth / "surfaces" / "heart_000.vtp")
     targets_mm = heart.vertices_mm
     missed_mm = target_registration_error_mm(np.array(found), true, targets_mm)
-    given = job.study.us.initial_mr_from_tracker if job.study.us else None
+    given = job.study.us.start() if job.study.us else None
     start = {}
     if given is not None:
-        start_mm = target_registration_error_mm(np.array(given), true, targets_mm)
+        start_mm = target_registration_error_mm(given, true, targets_mm)
         start = {"start_mean": round(float(start_mm.mean()), 3)}
     errors = np.abs(_frame_phase_errors(job, known))
     return {

@@ -89,8 +89,7 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
 def _start(job: Job) -> Float | None:
     """The first guess of where the tracker stands; None where the study gives none."""
     assert job.study.us is not None, "only a study with ultrasound is registered"
-    given = job.study.us.initial_mr_from_tracker
-    return None if given is None else np.array(given, dtype=float)
+    return job.study.us.start()
 
 
 def _registered(
