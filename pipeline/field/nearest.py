@@ -12,6 +12,9 @@ those whose boxes are nearer to one of the nodes than what was measured.
 Boxes are compared in single precision, sixteen at a time on a wide processor, and have been made
 larger by more than the rounding; triangles are measured in double precision, so the distance that
 comes out is exact.
+
+Kernels are compiled into their callers: a call hands over every array of the tree and of the work,
+and counts who holds them, a microsecond a cube in all.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pipeline.field.triangle_tree import TriangleTree, typical_size_mm
+from pipeline.field.triangle_tree import BOX_ROWS, FAN, TriangleTree, typical_size_mm
 from pipeline.geometry import Float, Float32, Integer
 
 # Nodes along the side of a task of one thread, and of a cube that is measured at once.
@@ -93,7 +96,7 @@ def levels_of_blocks(tree: TriangleTree, spacing_mm: tuple[float, float, float])
     return np.array(levels)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _prepare(tree):  # type: ignore[no-untyped-def]
     """Room for the longest lists there can be; only what is used becomes memory."""
     fan = tree.boxes.shape[2]
@@ -114,7 +117,7 @@ def _prepare(tree):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
 def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
     """Place in a list of the box whose middle is closest to the block's."""
     lists, away2, count = work.lists, work.bound, work.counts[depth]
@@ -122,16 +125,25 @@ def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
     for k in range(-count // LANES * -LANES):
         dx, dy, dz = lists[depth, 0, k] - x, lists[depth, 1, k] - y, lists[depth, 2, k] - z
         away2[k] = dx * dx + dy * dy + dz * dz
-    least = away2[0]
-    for k in range(count):
-        least = min(least, away2[k])
+    for k in range(count, -count // LANES * -LANES):
+        away2[k] = np.inf
+    # One minimum a lane, for a single one is found box after box.
+    least = np.empty(LANES, np.float32)
+    for lane in range(LANES):
+        least[lane] = np.inf
+    for k in range(0, count, LANES):
+        for lane in range(LANES):
+            least[lane] = min(least[lane], away2[k + lane])
+    nearest = least[0]
+    for lane in range(LANES):
+        nearest = min(nearest, least[lane])
     closest = 0
-    while away2[closest] > least:
+    while away2[closest] > nearest:
         closest += 1
     return closest
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
 def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ignore[no-untyped-def]
     """For each box: the least, over the corners of a block, of its squared distance less the
     bound there.
@@ -159,7 +171,7 @@ def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ig
         bound[k] = least
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _closest_point(triangles, t, point, closest):  # type: ignore[no-untyped-def]
     """The point of triangle t that is closest to another point."""
     x, y, z = point[0] - triangles[t, 0], point[1] - triangles[t, 1], point[2] - triangles[t, 2]
@@ -181,7 +193,7 @@ def _closest_point(triangles, t, point, closest):  # type: ignore[no-untyped-def
         closest[k] = triangles[t, k] + u * triangles[t, 3 + k] + v * triangles[t, 6 + k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
 def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: ignore[no-untyped-def]
     """Squared distance from nodes to some triangles of a list, where it is less than ``best``.
 
@@ -215,7 +227,7 @@ def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: igno
             best[i] = min(best[i], plane2 + w * w)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _select(work, depth):  # type: ignore[no-untyped-def]
     """Find the boxes of a list that come nearer to a corner than the bound there; how many."""
     count = work.counts[depth]
@@ -244,7 +256,7 @@ def _select(work, depth):  # type: ignore[no-untyped-def]
     return used
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _narrow(tree, work, depth):  # type: ignore[no-untyped-def]
     """Find the boxes of a list that can hold the nearest to the block's nodes; how many."""
     number = work.numbers[depth, _closest_middle(work, depth)]
@@ -260,24 +272,26 @@ def _narrow(tree, work, depth):  # type: ignore[no-untyped-def]
     return _select(work, depth)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _open(tree, work, source, target, count):  # type: ignore[no-untyped-def]
     """Fill a list with what the kept boxes of another, or of the same, hold."""
-    boxes, fan, kept = tree.boxes, tree.boxes.shape[2], work.kept
+    boxes, kept = tree.boxes, work.kept
     start = tree.starts[work.held[source] - 1]
+    lists, numbers = work.lists[target], work.numbers[target]
     for k in range(count):
         kept[k] = work.numbers[source, kept[k]]
     for k in range(count):
-        for row in range(boxes.shape[1]):
-            for lane in range(fan):
-                work.lists[target, row, k * fan + lane] = boxes[start + kept[k], row, lane]
-        for lane in range(fan):
-            work.numbers[target, k * fan + lane] = kept[k] * fan + lane
-    work.counts[target] = fan * count
+        group, first = start + kept[k], k * FAN
+        for row in range(BOX_ROWS):
+            for lane in range(FAN):
+                lists[row, first + lane] = boxes[group, row, lane]
+        for lane in range(FAN):
+            numbers[first + lane] = kept[k] * FAN + lane
+    work.counts[target] = FAN * count
     work.held[target] = work.held[source] - 1
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _copy(work, source, target, count):  # type: ignore[no-untyped-def]
     """Fill a list with the kept boxes of another, or drop the rest of the same."""
     for row in range(work.lists.shape[1]):
@@ -289,7 +303,7 @@ def _copy(work, source, target, count):  # type: ignore[no-untyped-def]
     work.held[target] = work.held[source]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
     """Make a block's list, at ``depth + 1``, from that of the block around it."""
     source, target = depth, depth + 1
@@ -301,7 +315,7 @@ def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
     _copy(work, source, target, count)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _open_all(tree, work, depth):  # type: ignore[no-untyped-def]
     """Open a list's boxes that can hold the nearest, down to triangles; where that list is."""
     source = depth
@@ -311,7 +325,7 @@ def _open_all(tree, work, depth):  # type: ignore[no-untyped-def]
     return source
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _list_all(tree, work):  # type: ignore[no-untyped-def]
     """Make the list at depth 0: all boxes of the last level."""
     first = NOUGHT
@@ -324,7 +338,7 @@ def _list_all(tree, work):  # type: ignore[no-untyped-def]
     _open(tree, work, first, first, groups)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _place(tree, work, axes, corner, size):  # type: ignore[no-untyped-def]
     """Go to the block of ``size`` nodes a side whose first node is ``corner`` (z, y, x)."""
     for k in range(3):
@@ -334,7 +348,7 @@ def _place(tree, work, axes, corner, size):  # type: ignore[no-untyped-def]
         work.middle[k] = axis[0] + corner[2 - k] * step + work.half[k] - tree.centre_mm[k]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _fill_cube(tree, work, axes, depth, corner, out):  # type: ignore[no-untyped-def]
     """Distances of a cube of 2 x 2 x 2 nodes, each of which is a corner."""
     for lane in range(CORNERS):

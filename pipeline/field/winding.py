@@ -62,7 +62,7 @@ def negate_inside(
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _edge_side(vertices, first, second, y, z):  # type: ignore[no-untyped-def]
     """Twice the signed area of the edge and the ray seen along x; and its sign, never zero
     unless the edge is seen as a point."""
@@ -80,7 +80,7 @@ def _edge_side(vertices, first, second, y, z):  # type: ignore[no-untyped-def]
     return flip * area, flip * np.sign(sign)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _node_range(low, high, start, step, count):  # type: ignore[no-untyped-def]
     """First and one past the last node of [low, high], one wider for rounding."""
     first = max(math.floor((low - start) / step), 0)
@@ -88,7 +88,7 @@ def _node_range(low, high, start, step, count):  # type: ignore[no-untyped-def]
     return first, end
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def crossing(vertices, a, b, c, y, z):  # type: ignore[no-untyped-def]
     """Direction in which the ray along x through (y, z) crosses the triangle (0: not at all), and
     where; 1 where the triangle faces +x."""
@@ -131,7 +131,7 @@ def _count_crossings(vertices, triangles, x_mm, y_mm, z_mm, first, end, winding)
     return not _accumulate(winding, first, end)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _accumulate(winding, first, end):  # type: ignore[no-untyped-def]
     """Sum the crossings along the rows; how many rows do not end outside."""
     open_rows = 0
