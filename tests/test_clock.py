@@ -165,6 +165,36 @@ def test_beats_of_two_kinds_in_turn_are_no_fibrillation():
     assert not ticks[ticks[:, 0] > 5.0, 3].any()
 
 
+@pytest.mark.parametrize("lengths_s", [(0.6, 0.8), (0.4, 0.8), (0.4, 0.6, 0.8)])
+def test_a_block_that_changes_by_chance_is_hardly_ever_trusted(lengths_s):
+    """Flutter of the atria, of whose turns two, three or four make a beat: nothing tells which.
+
+    Of two lengths as likely, one in 16 beats comes after three that were alike, and is another.
+    """
+    beats = wrong = 0
+    for seed in range(4):
+        r_s = np.cumsum(np.random.default_rng(seed).choice(lengths_s, 150))
+        ticks, _ = follow(r_s, r_s[-1])
+        at = ticks[np.searchsorted(ticks[:, 0], r_s[20:]) - 1]
+        beats += len(at)
+        wrong += int(((at[:, 3] == 1) & (np.abs(cyclic(at[:, 1])) > 0.1)).sum())
+    assert wrong < beats / 16
+
+
+def test_a_single_early_beat_costs_one_regular_interval():
+    """So do two of them, some beats apart: that is no habit yet."""
+    rr_s = np.full(60, 0.8)
+    rr_s[[30, 38]], rr_s[[31, 39]] = 0.5, 1.1
+    r_s = 0.2 + np.cumsum(rr_s)
+    ticks, _ = follow(r_s, r_s[-1])
+    for early in (30, 38):
+        # The pause's end is no regular beat; the one after it is, and is told later.
+        known_s = r_s[early + 2] + KNOWN_S
+        assert not ticks[(ticks[:, 0] > r_s[early] + KNOWN_S) & (ticks[:, 0] < known_s), 3].any()
+        later = (ticks[:, 0] > known_s + 0.8) & (ticks[:, 0] < r_s[early + 5])
+        assert ticks[later, 3].all()
+
+
 @given(f_max_n=st.floats(0.5, 12.0), rate=st.floats(1.0, 50.0), seed=st.integers(0, 5))
 def test_no_force_step_exceeds_the_limit(f_max_n, rate, seed):
     rng = np.random.default_rng(seed)

@@ -20,6 +20,10 @@ IRREGULAR, ORDERLY = 0.075, 0.05
 """Step from interval to interval, as a share, which two thirds of the steps exceed where the rhythm
 has no order; and below which it has one again."""
 
+MOST_NEEDED = 6
+"""Regular intervals in a row, at most, after which a rhythm that often surprised is trusted again.
+Where beats come after three or four turns of the atria by chance, so many alike are rare."""
+
 LOST, REGULAR, ECTOPIC, FIBRILLATING = range(4)
 NORMAL_BEAT, ECTOPIC_BEAT, IRREGULAR_BEAT = range(3)
 # Places of the state.
@@ -82,6 +86,9 @@ def judge(c: Float, regular: bool, off_s: float) -> bool:
         c[STATE], c[NEEDED] = REGULAR, 1.0
     elif not (regular or steady):
         c[STATE] = ECTOPIC
+        # One early beat and the pause after it are no habit.
+        often = min(_surprises(c) - 3, MOST_NEEDED)
+        c[NEEDED] = max(c[NEEDED], float(often))
     if c[STATE] != REGULAR:
         c[VALID] = 0.0
     _predict(c)
@@ -99,6 +106,16 @@ def _settled(c: Float) -> bool:
     one, two, three = interval(c, 0), interval(c, 1), interval(c, 2)
     low, high = min(one, min(two, three)), max(one, max(two, three))
     return high - low <= REGULAR_SHARE * high
+
+
+@inner
+def _surprises(c: Float) -> int:
+    """How many of the last intervals were not as expected, though between beats of one shape."""
+    count, found = int(min(c[COUNT], float(KEPT))), 0
+    for back in range(count):
+        if _own(c, count, back) and not _was_regular(c, back):
+            found += 1
+    return found
 
 
 @asked

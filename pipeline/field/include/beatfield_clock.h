@@ -146,6 +146,7 @@ extern "C" {
 #define BFC_QUICKEST 1.5
 #define BFC_IRREGULAR 0.075
 #define BFC_ORDERLY 0.05
+#define BFC_MOST_NEEDED 6 /* regular intervals in a row, of a rhythm that often surprised */
 #define BFC_AHEAD_S 3.0
 #define BFC_SLACK_S 0.02
 #define BFC_TICK_S 0.001
@@ -279,6 +280,15 @@ static int bfc_own(const bf_clock *c, int count, int back)
     return !before && c->known.regular[bfc_slot(c, back)] >= 0;
 }
 
+/* How many of the last intervals were not as expected, though between beats of one shape. */
+static int bfc_surprises(const bf_clock *c)
+{
+    int count = c->known.count < BF_CLOCK_KEPT ? (int)c->known.count : BF_CLOCK_KEPT, back, found = 0;
+    for (back = 0; back < count; back++)
+        found += bfc_own(c, count, back) && !bfc_was_regular(c, back);
+    return found;
+}
+
 /* Size that a third of the steps between intervals `lag` apart stay under. */
 static double bfc_usual_step(const bf_clock *c, int count, int lag)
 {
@@ -344,7 +354,7 @@ static void bfc_predict(bf_clock *c)
    intervals agree (bfc_settled). */
 static int bfc_judge(bf_clock *c, int regular, double off_s)
 {
-    int steady = bfc_settled(c), back;
+    int steady = bfc_settled(c), back, often;
     double share;
     if (!regular && steady) {
         for (back = 0; back < BF_CLOCK_KEPT; back++)
@@ -363,6 +373,12 @@ static int bfc_judge(bf_clock *c, int regular, double off_s)
         c->known.needed = 1;
     } else if (!(regular || steady)) {
         c->known.rhythm = BF_ECTOPIC;
+        /* One early beat and the pause after it are no habit. */
+        often = bfc_surprises(c) - 3;
+        if (often > BFC_MOST_NEEDED)
+            often = BFC_MOST_NEEDED;
+        if (often > c->known.needed)
+            c->known.needed = often;
     }
     if (c->known.rhythm != BF_REGULAR)
         c->valid = 0;
