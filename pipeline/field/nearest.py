@@ -14,7 +14,7 @@ larger by more than the rounding; triangles are measured in double precision, so
 comes out is exact.
 
 Kernels are compiled into their callers: a call hands over every array of the tree and of the work,
-and counts who holds them, a microsecond a cube in all.
+and counts who holds them, 0.4 microseconds a cube in all.
 """
 
 from __future__ import annotations
