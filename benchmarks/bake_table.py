@@ -3,9 +3,9 @@
     python benchmarks/bake_table.py SURFACES          # a study's products' folder `surface`
 
 Every row is a process of its own, with the default settings but for spacing and margin. Seconds and
-memory are that process's, start and certificate included; of the surfaces those of the default
-fixtures are taken, as of a study's; errors are the certificate's own, worst
-of the structures, against the surfaces given.
+memory are that process's, start and certificate included. Of the surfaces those of the default
+fixtures are taken, as of a study's; errors are the certificate's own, worst of the structures,
+against the surfaces given.
 """
 
 from __future__ import annotations

@@ -86,7 +86,8 @@ def judge(c: Float, regular: bool, off_s: float) -> bool:
         c[STATE], c[NEEDED] = REGULAR, 1.0
     elif not (regular or steady):
         c[STATE] = ECTOPIC
-        # One early beat and the pause after it are no habit.
+        # Two early beats and the pauses after them are no habit. What came before a new rate counts
+        # as unexpected: three alike may be chance.
         often = min(_surprises(c) - 3, MOST_NEEDED)
         c[NEEDED] = max(c[NEEDED], float(often))
     if c[STATE] != REGULAR:

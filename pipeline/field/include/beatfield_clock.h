@@ -373,7 +373,8 @@ static int bfc_judge(bf_clock *c, int regular, double off_s)
         c->known.needed = 1;
     } else if (!(regular || steady)) {
         c->known.rhythm = BF_ECTOPIC;
-        /* One early beat and the pause after it are no habit. */
+        /* Two early beats and the pauses after them are no habit. What came before a new rate counts
+           as unexpected: three alike may be chance. */
         often = bfc_surprises(c) - 3;
         if (often > BFC_MOST_NEEDED)
             often = BFC_MOST_NEEDED;
