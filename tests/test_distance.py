@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import InputError
 from pipeline.exact import ExactSurface
 from pipeline.field.distance import distance_of_closed, require_closed
+from pipeline.field.triangle_tree import plant
 from pipeline.geometry import Float, Grid, Integer, Surface
 
 EPSILON = float(np.finfo(np.float32).eps)
@@ -216,6 +217,23 @@ def test_threads_and_repeats_give_the_same_bytes(threads):
     alone = distance_of_closed(surface, grid, threads=1)
 
     assert distance_of_closed(surface, grid, threads=threads).tobytes() == alone.tobytes()
+
+
+def test_a_tree_planted_by_many_threads_is_the_same():
+    surface = lumpy(5, level=6)
+    # Some without area, in every thread's share, which leave gaps that are closed.
+    flat = surface.triangles[::50][:, [0, 0, 1]]
+    triangles = np.concatenate([surface.triangles, flat])
+    around_mm = np.array([[-50.0] * 3, [50.0] * 3])
+
+    alone = plant(surface.vertices_mm, triangles, around_mm, threads=1)
+
+    assert len(alone.triangles) == len(surface.triangles)
+    for threads in (2, 3, 7):
+        shared = plant(surface.vertices_mm, triangles, around_mm, threads)
+        assert all(
+            one.tobytes() == other.tobytes() for one, other in zip(alone, shared, strict=True)
+        )
 
 
 def some_nodes(grid: Grid, count: int, seed: int = 0) -> Integer:

@@ -78,7 +78,7 @@ def distance_of_closed(surface: Surface, grid: Grid, threads: int | None = None)
     -------
     ``(z, y, x)`` array, mm.
     """
-    from pipeline.field.nearest import TOP, block_distance, levels_of_blocks
+    from pipeline.field.nearest import TOP, block_distance, levels_of_blocks, prepared
     from pipeline.field.triangle_tree import plant
     from pipeline.field.winding import negate_inside
 
@@ -88,15 +88,19 @@ def distance_of_closed(surface: Surface, grid: Grid, threads: int | None = None)
     threads = threads or processors()
     # Blocks at the end of the grid reach beyond it.
     beyond_mm = grid.upper_mm + TOP * np.array(grid.spacing_mm)
-    tree = plant(vertices_mm, triangles, np.array([grid.origin_mm, beyond_mm]))
+    tree = plant(vertices_mm, triangles, np.array([grid.origin_mm, beyond_mm]), threads)
     levels = levels_of_blocks(tree, grid.spacing_mm)
     distance_mm = np.empty(grid.shape, dtype=np.float32)
 
-    def fill(corner: tuple[int, int, int]) -> None:
-        block_distance(tree, levels, axes_mm, *corner, distance_mm)
+    blocks = product(*(range(0, count, TOP) for count in grid.shape))
 
-    nz, ny, nx = (range(0, count, TOP) for count in grid.shape)
+    def fill(_: int) -> None:
+        work = prepared(tree)
+        # Threads take turns to ask for the next block.
+        for corner in blocks:
+            block_distance(tree, work, levels, axes_mm, *corner, distance_mm)
+
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(fill, product(nz, ny, nx)))
+        list(pool.map(fill, range(threads)))
     negate_inside(distance_mm, vertices_mm, triangles, axes_mm, threads)
     return distance_mm

@@ -96,9 +96,12 @@ def levels_of_blocks(tree: TriangleTree, spacing_mm: tuple[float, float, float])
     return np.array(levels)
 
 
-@njit(nogil=True, cache=True, forceinline=True)
-def _prepare(tree):  # type: ignore[no-untyped-def]
-    """Room for the longest lists there can be; only what is used becomes memory."""
+@njit(nogil=True, cache=True)
+def prepared(tree):  # type: ignore[no-untyped-def]
+    """Room for the longest lists there can be; only what is used becomes memory.
+
+    Compiled, for NumPy asks for pages of megabytes, which are cleared whole.
+    """
     fan = tree.boxes.shape[2]
     room = (len(tree.triangles) // fan + 1 + fan) * fan + LANES
     return Work(
@@ -374,14 +377,13 @@ def _fill_cube(tree, work, axes, depth, corner, out):  # type: ignore[no-untyped
 
 
 @njit(nogil=True, cache=True)
-def block_distance(tree, levels, axes, z, y, x, out):  # type: ignore[no-untyped-def]
+def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-untyped-def]
     """Unsigned distance, mm, of a block of 32 nodes a side, or what of it is in the grid.
 
     ``axes`` are the coordinates of the nodes along x, y and z; (z, y, x) is the block's first
     node; ``out`` is the grid's array ``(z, y, x)``. Blocks are halved and their parts visited
     in depth, so that one list a depth is in use.
     """
-    work = _prepare(tree)
     _list_all(tree, work)
     _place(tree, work, axes, (z, y, x), NOUGHT + TOP)
     _enter(tree, work, NOUGHT, levels[0])

@@ -11,6 +11,9 @@ Importing this module imports numba. The kernels release the interpreter lock.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +26,11 @@ FAN = 8
 BOX_ROWS = 12
 # Numbers of a triangle: see `TriangleTree.triangles`.
 TRIANGLE_NUMBERS = 19
+# Fewer triangles than these are not worth a thread of their own.
+SHARE = 8192
 # Boxes that are not there are far from everything.
 NOWHERE_MM = 1e6
+_NO_BOX = np.array([NOWHERE_MM] * 3 + [1, 0, 0, 0, 1, 0, 0, 0, 0], dtype=np.float32)[:, None]
 # How much larger than exact a box must be, as a share of R, the largest distance from the centre.
 # Rounding to single precision moves a number by 2^-24 of itself at most. A point and a box's middle
 # are each off by R 2^-24 along every axis and their difference, up to 2 R, by as much again, which
@@ -52,30 +58,66 @@ class TriangleTree(NamedTuple):
     """Middle of the surface."""
 
 
-def plant(vertices_mm: Float, triangles: Integer, around_mm: Float) -> TriangleTree:
+def plant(
+    vertices_mm: Float, triangles: Integer, around_mm: Float, threads: int = 1
+) -> TriangleTree:
     """Build the tree of ``(n, 3)`` vertices and ``(m, 3)`` vertex numbers.
 
     ``around_mm`` are two opposite corners ``(2, 3)`` of the space from which distances will be
     asked. Triangles without area are left out: they are lines, and in a closed surface the
-    triangles beside them cover those.
+    triangles beside them cover those. The tree does not depend on the number of threads.
     """
     low, high = vertices_mm.min(axis=0), vertices_mm.max(axis=0)
     centre_mm = 0.5 * (low + high)
     reach_mm = float(max(np.abs(around_mm - centre_mm).max(), np.abs(high - centre_mm).max()))
-    order, middles = np.arange(len(triangles)), np.empty((len(triangles), 3))
-    _middles(vertices_mm, triangles, middles)
-    _sort(middles, order, 0, len(order))
-    flat = np.empty((len(triangles), TRIANGLE_NUMBERS))
-    flat = flat[: _lay_flat(vertices_mm, triangles, order, centre_mm, flat)]
-    starts = _level_starts(len(flat))
-    boxes = np.zeros((starts[-1], BOX_ROWS, FAN), dtype=np.float32)
-    boxes[:, :3] = NOWHERE_MM
-    boxes[:, 3] = boxes[:, 7] = 1
     wider_mm = np.sqrt(3) * reach_mm * WIDER
-    _box_triangles(flat, boxes, wider_mm)
-    for level in range(1, len(starts) - 1):
-        _box_boxes(boxes, starts[level - 1], starts[level], _box_count(len(flat), level), wider_mm)
+    threads = max(1, min(threads, len(triangles) // SHARE))
+    with ThreadPoolExecutor(threads) as pool:
+        order = _sorted(vertices_mm, triangles, pool, threads)
+        flat = np.empty((len(triangles), TRIANGLE_NUMBERS))
+        runs = _runs(len(flat), threads)
+        lay_flat = partial(_lay_flat, vertices_mm, triangles, order, centre_mm, flat)
+        used = 0
+        for (first, _), count in zip(
+            runs, pool.map(lay_flat, *zip(*runs, strict=True)), strict=True
+        ):
+            if used < first:
+                flat[used : used + count] = flat[first : first + count]
+            used += count
+        flat = flat[:used]
+        starts = _level_starts(len(flat))
+        boxes = np.empty((starts[-1], BOX_ROWS, FAN), dtype=np.float32)
+        # The last group of a level may hold fewer than eight.
+        boxes[starts[1:] - 1] = _NO_BOX
+        runs = _runs(len(flat), threads)
+        list(pool.map(partial(_box_triangles, flat, boxes, wider_mm), *zip(*runs, strict=True)))
+        for level in range(1, len(starts) - 1):
+            box = partial(_box_boxes, boxes, starts[level - 1], starts[level], wider_mm)
+            runs = _runs(_box_count(len(flat), level), threads)
+            list(pool.map(box, *zip(*runs, strict=True)))
     return TriangleTree(boxes, starts, flat, centre_mm)
+
+
+def _runs(count: int, threads: int) -> list[tuple[int, int]]:
+    """First and end of runs of about equal length, of whole groups of eight but for the last."""
+    cuts = np.linspace(0, count, threads + 1).astype(int) // FAN * FAN
+    cuts[-1] = count
+    return list(pairwise(cuts))
+
+
+def _sorted(
+    vertices_mm: Float, triangles: Integer, pool: ThreadPoolExecutor, threads: int
+) -> Integer:
+    """Triangles in an order in which every run of 8, 16, 32, ... is close together."""
+    order, middles = np.arange(len(triangles)), np.empty((len(triangles), 3))
+    find = partial(_middles, vertices_mm, triangles, middles)
+    list(pool.map(find, *zip(*_runs(len(order), threads), strict=True)))
+    runs = [(0, len(order))]
+    while len(runs) < threads:
+        parts = pool.map(partial(_halve, middles, order), *zip(*runs, strict=True))
+        runs = [half for (a, c), b in zip(runs, parts, strict=True) for half in ((a, b), (b, c))]
+    list(pool.map(partial(_sort, middles, order), *zip(*runs, strict=True)))
+    return order
 
 
 def _box_count(triangles: int, level: int) -> int:
@@ -103,9 +145,9 @@ def typical_size_mm(tree: TriangleTree) -> list[float]:
 
 
 @njit(nogil=True, cache=True)
-def _middles(vertices, triangles, middles):  # type: ignore[no-untyped-def]
-    """Three times the middle of every triangle."""
-    for number in range(len(triangles)):
+def _middles(vertices, triangles, middles, first, end):  # type: ignore[no-untyped-def]
+    """Three times the middle of the triangles ``first`` to ``end``."""
+    for number in range(first, end):
         a, b, c = triangles[number, 0], triangles[number, 1], triangles[number, 2]
         for k in range(3):
             middles[number, k] = vertices[a, k] + vertices[b, k] + vertices[c, k]
@@ -113,10 +155,7 @@ def _middles(vertices, triangles, middles):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def _sort(middles, order, first, end):  # type: ignore[no-untyped-def]
-    """Order triangles so that every run of 8, 16, 32, ... is close together.
-
-    Runs are halved across their longest side until they are no longer than eight.
-    """
+    """Halve runs until they are no longer than eight."""
     waiting = np.empty((64, 2), dtype=np.int64)
     waiting[0, 0], waiting[0, 1] = first, end
     height = 1
@@ -124,11 +163,18 @@ def _sort(middles, order, first, end):  # type: ignore[no-untyped-def]
         height -= 1
         first, end = waiting[height, 0], waiting[height, 1]
         while end - first > FAN:
-            part = first + ((end - first) // 2 + FAN - 1) // FAN * FAN
-            _select(middles, order, first, end - 1, part, _widest(middles, first, end))
+            part = _halve(middles, order, first, end)
             waiting[height, 0], waiting[height, 1] = part, end
             height += 1
             end = part
+
+
+@njit(nogil=True, cache=True)
+def _halve(middles, order, first, end):  # type: ignore[no-untyped-def]
+    """Part a run across its longest side; where its second half begins."""
+    part = first + ((end - first) // 2 + FAN - 1) // FAN * FAN
+    _select(middles, order, first, end - 1, part, _widest(middles, first, end))
+    return part
 
 
 @njit(nogil=True, cache=True)
@@ -170,11 +216,12 @@ def _select(middles, order, low, high, part, axis):  # type: ignore[no-untyped-d
 
 
 @njit(nogil=True, cache=True)
-def _lay_flat(vertices, triangles, order, centre, flat):  # type: ignore[no-untyped-def]
-    """Describe triangles in their own planes; returns how many have an area."""
-    used = 0
+def _lay_flat(vertices, triangles, order, centre, flat, first, end):  # type: ignore[no-untyped-def]
+    """Describe the triangles of a run in their own planes, from ``flat[first]`` on; returns how
+    many have an area."""
+    used = first
     ab, ac = np.empty(3), np.empty(3)
-    for number in order:
+    for number in order[first:end]:
         longest, turn = -1.0, 0
         for k in range(3):
             a, b = triangles[number, k], triangles[number, (k + 1) % 3]
@@ -193,7 +240,7 @@ def _lay_flat(vertices, triangles, order, centre, flat):  # type: ignore[no-unty
             ab[axis] = (vertices[b, axis] - vertices[a, axis]) / length
             ac[axis] = vertices[c, axis] - vertices[a, axis]
         used += _describe(ab, ac, length, flat[used])
-    return used
+    return used - first
 
 
 @njit(nogil=True, cache=True)
@@ -225,9 +272,9 @@ def _describe(ab, ac, length, out):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _box_triangles(flat, boxes, wider):  # type: ignore[no-untyped-def]
+def _box_triangles(flat, boxes, wider, first, end):  # type: ignore[no-untyped-def]
     """Boxes of triangles: along AB, across it, and flat."""
-    for number in range(len(flat)):
+    for number in range(first, end):
         group, lane = number // FAN, number % FAN
         half_along, half_across = 0.5 * flat[number, 12], 0.5 * flat[number, 17] * flat[number, 18]
         for k in range(3):
@@ -298,10 +345,11 @@ def _choose_axes(boxes, group, count, axes, normal):  # type: ignore[no-untyped-
 
 
 @njit(nogil=True, cache=True)
-def _box_boxes(boxes, source, target, count, wider):  # type: ignore[no-untyped-def]
-    """Boxes around the groups from ``source`` on, each of eight boxes or, at the end, fewer."""
+def _box_boxes(boxes, source, target, wider, first, end):  # type: ignore[no-untyped-def]
+    """Boxes around the groups ``first`` to ``end`` of the level from ``source`` on, each of eight
+    boxes or, at the end, fewer."""
     axes, normal = np.empty((3, 3)), np.empty(3)
-    for number in range(count):
+    for number in range(first, end):
         held = source + number
         lanes = FAN
         while boxes[held, 0, lanes - 1] == NOWHERE_MM:
