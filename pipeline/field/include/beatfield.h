@@ -164,7 +164,7 @@ typedef struct {
 
 /* Force on a whole tool, newtons, and torque about its handle, newton-millimetres (may be NULL), both
  * in the frame of the MR: the mean of the field's force over the tool's length, so no tool feels more
- * than f_max. Pieces are halved where the field demands it, until halving them once more would change
+ * than f_max. Stretches are divided where the field demands it, until dividing them once more would change
  * the force by less than bound_n; evaluations (may be NULL) says how often the field was asked.
  * mr_from_tool is a rotation and a shift, within 1e-3, row after row; the last row is 0 0 0 1. A tool
  * longer than 20 times the grid's diagonal, as one in micrometres, is refused: BF_WRONG_SIZE. How long
@@ -1888,6 +1888,12 @@ void bf_turn_back(const double transform[16], const double vector[3], double tur
 /* ---- whole tools ---- */
 
 typedef struct {
+    double point_mm[3]; /* in the tool's frame */
+    double force_n[3];  /* in the MR frame */
+    double distance_mm;
+} bf__feel;
+
+typedef struct {
     const bf_field *field;
     const bf_fixture_part *law;
     const bf_tool *tool;
@@ -1895,15 +1901,16 @@ typedef struct {
     double phase, bound_n, longest_mm, force_n[3], torque_nmm[3];
     int pieces, piece, evaluations, sound;
     double piece_start_mm, piece_length_mm; /* of the piece that was asked for last */
+    bf__feel last;                          /* of the stretch before */
 } bf__walk;
 
-enum { BF__HALVINGS = 12, BF__LONGEST = 20 };
+enum { BF__DIVISIONS = 8, BF__LONGEST = 20 };
 
-/* A stretch that is more than this share of its tool has few beside it to make up for its error: it is so
- * much shorter, and may change by so much less, before it is believed. */
-#define BF__LARGE 0.2
-#define BF__FINER 0.125
-#define BF__STRICTER (1.0 / 3.0)
+/* Spacings of the grid from end to end of a stretch that is believed, so one from place to place: the
+ * spline's curvature changes from node to node, and longer stretches could step over that. */
+#define BF__LONGEST_SPACINGS 3.0
+/* Share of the bound that a turn of the force between two places may be worth to a stretch. */
+#define BF__UNSEEN (1.0 / 3.0)
 
 static double bf__length(const bf_tool *tool, int piece)
 {
@@ -1934,12 +1941,6 @@ static void bf__point(bf__walk *walk, double along_mm, double point_mm[3])
     for (axis = 0; axis < 3; axis++) point_mm[axis] = a[axis] + share * (b[axis] - a[axis]);
 }
 
-typedef struct {
-    double point_mm[3]; /* in the tool's frame */
-    double force_n[3];  /* in the MR frame */
-    double distance_mm;
-} bf__feel;
-
 static void bf__ask(bf__walk *walk, double along_mm, bf__feel *feel)
 {
     double moved[3], gradient[3];
@@ -1966,43 +1967,57 @@ static void bf__add(bf__walk *walk, const bf__feel *feel, double weight)
     walk->torque_nmm[2] += weight * (lever[0] * f[1] - lever[1] * f[0]);
 }
 
-/* The stretch of the given length about a middle that has been asked already. The distance changes
- * by no more than the way: where even the least distance on the stretch gives a force below the
- * bound, the middle speaks for all of it. */
+static double bf__apart2(const bf__feel *a, const bf__feel *b)
+{
+    double x = a->force_n[0] - b->force_n[0], y = a->force_n[1] - b->force_n[1], z = a->force_n[2] - b->force_n[2];
+    return x * x + y * y + z * z;
+}
+
+static double bf__larger(double a, double b) { return a > b ? a : b; }
+
+/* The stretch of the given length about a middle that has been asked already, as what is next after it.
+ * It is asked in the middles of its outer thirds, and divided into thirds until MacLaurin's rule of these
+ * places changes the middle's answer by less than the bound, and until a turn of the force between any two
+ * of them, or one and that beside the stretch, would be worth less than a third of it: a sixth of the stretch
+ * lies on this side of such a turn and would be counted on the other. The distance changes by no more than
+ * the way: where even the least distance on the stretch gives a force below the bound, the middle speaks
+ * for all of it. */
 static void bf__stretch(bf__walk *walk, double middle_mm, double length_mm, double share,
-                        const bf__feel *middle, int depth)
+                        const bf__feel *middle, const bf__feel *next, int depth)
 {
     bf__feel left, right;
-    double way = 0.5 * length_mm, reach, off = 0, fine_mm = walk->longest_mm, bound_n = walk->bound_n;
+    double way = 0.5 * length_mm, third = length_mm / 3, bound2 = walk->bound_n * walk->bound_n, reach, off = 0;
+    double apart2;
     int axis;
-    /* Without a number no bound is ever kept, and a tick would be over long before the halving. */
+    /* Without a number no bound is ever kept, and a tick would be over long before the dividing. */
     if (!walk->sound) return;
     reach = walk->law->side == 0 ? fabs(middle->distance_mm) : walk->law->side * middle->distance_mm;
     if (2 * walk->law->f_max_n * bf__height(walk->law, walk->law->side < 0 ? -(reach + way) : reach + way) <=
         walk->bound_n) {
         bf__add(walk, middle, share);
+        walk->last = *middle;
         return;
     }
-    bf__ask(walk, middle_mm - way / 2, &left);
-    bf__ask(walk, middle_mm + way / 2, &right);
+    bf__ask(walk, middle_mm - third, &left);
+    bf__ask(walk, middle_mm + third, &right);
     for (axis = 0; axis < 3; axis++) {
-        double change = 0.5 * (left.force_n[axis] + right.force_n[axis]) - middle->force_n[axis];
+        double change = 0.375 * (left.force_n[axis] + right.force_n[axis]) - 0.75 * middle->force_n[axis];
         off += change * change;
     }
-    /* The midpoint rule errs by about four thirds of the change that halving makes, Simpson's
-     * combination of both by far less: the change itself is a bound with room to spare. */
-    if (share > BF__LARGE) {
-        fine_mm *= BF__FINER;
-        bound_n *= BF__STRICTER;
-    }
-    if ((length_mm <= fine_mm && off <= bound_n * bound_n) || depth == BF__HALVINGS) {
-        bf__add(walk, &left, share * 2 / 3);
-        bf__add(walk, &right, share * 2 / 3);
-        bf__add(walk, middle, -share / 3);
+    apart2 = bf__larger(bf__apart2(&left, middle), bf__apart2(middle, &right));
+    apart2 = bf__larger(apart2, bf__larger(bf__apart2(&walk->last, &left), bf__apart2(&right, next)));
+    if ((length_mm <= walk->longest_mm && off <= bound2 &&
+         share * share * apart2 <= 36 * BF__UNSEEN * BF__UNSEEN * bound2) ||
+        depth == BF__DIVISIONS) {
+        bf__add(walk, &left, share * 0.375);
+        bf__add(walk, middle, share * 0.25);
+        bf__add(walk, &right, share * 0.375);
+        walk->last = right;
         return;
     }
-    bf__stretch(walk, middle_mm - way / 2, way, share / 2, &left, depth + 1);
-    bf__stretch(walk, middle_mm + way / 2, way, share / 2, &right, depth + 1);
+    bf__stretch(walk, middle_mm - third, third, share / 3, &left, middle, depth + 1);
+    bf__stretch(walk, middle_mm, third, share / 3, middle, &right, depth + 1);
+    bf__stretch(walk, middle_mm + third, third, share / 3, &right, next, depth + 1);
 }
 
 bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
@@ -2010,7 +2025,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
                         double force_n[3], double torque_nmm[3], int *evaluations)
 {
     bf__walk walk;
-    bf__feel feel;
+    bf__feel feel, ahead;
     double total = 0, length, sum, diagonal2 = 0;
     int n, stretches;
     memset(force_n, 0, 3 * sizeof(double));
@@ -2018,7 +2033,7 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     if (evaluations) *evaluations = 0;
     if (fixture < 0 || fixture >= field->fixtures) return BF_NO_SUCH_NAME;
     if (tool->count < 1) return BF_WRONG_SIZE;
-    if (!(bound_n > 0)) return BF_WRONG_BOUND;
+    if (!(bound_n > 0) || !bf__numeric(bound_n)) return BF_WRONG_BOUND;
     for (n = 0, sum = phase; n < 12; n++) sum += mr_from_tool[n];
     if (!bf__numeric(sum)) return BF_NOT_FINITE;
     if (!bf__rigid(mr_from_tool)) return BF_NOT_RIGID;
@@ -2041,16 +2056,22 @@ bf_status bf_tool_force(const bf_field *field, int fixture, const bf_tool *tool,
     walk.longest_mm = field->spacing_mm[0];
     for (n = 1; n < 3; n++)
         if (field->spacing_mm[n] < walk.longest_mm) walk.longest_mm = field->spacing_mm[n];
-    /* Curvature of the spline changes from node to node: longer stretches could step over it. */
-    walk.longest_mm *= 2;
+    walk.longest_mm *= BF__LONGEST_SPACINGS;
     if (walk.pieces) walk.piece_length_mm = bf__length(tool, 0);
-    length = 4 * walk.longest_mm;
+    length = 3 * walk.longest_mm;
     stretches = total > length ? (int)ceil(total / length < 1e6 ? total / length : 1e6) : 1;
+    bf__ask(&walk, 0, &walk.last);
+    ahead = walk.last;
+    if (total > 0) bf__ask(&walk, 0.5 * total / stretches, &ahead);
+    else {
+        bf__add(&walk, &walk.last, 1);
+        stretches = 0;
+    }
     for (n = 0; n < stretches && walk.sound; n++) {
-        double middle = (n + 0.5) * total / stretches;
-        bf__ask(&walk, middle, &feel);
-        if (total > 0) bf__stretch(&walk, middle, total / stretches, 1.0 / stretches, &feel, 0);
-        else bf__add(&walk, &feel, 1);
+        double middle = (n + 0.5) * total / stretches, after = (n + 1.5) * total / stretches;
+        feel = ahead;
+        bf__ask(&walk, after < total ? after : total, &ahead);
+        bf__stretch(&walk, middle, total / stretches, 1.0 / stretches, &feel, &ahead, 0);
     }
     if (!walk.sound) return BF_DAMAGED;
     /* What no length has told: a handle or an only point that is not finite, or too far away. */
