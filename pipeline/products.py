@@ -70,7 +70,16 @@ def read_cine(folder: Path) -> Cine:
         np.array(timing["phases"]),
         float(timing["rr_s"]),
         tuple(timing.get("interpolated_slices", ())),
+        _rr_s_by_slice(timing.get("rr_ms", [])),
     )
+
+
+def _rr_s_by_slice(told_ms: Sequence[float | None]) -> tuple[float, ...]:
+    """RR interval of every slice; of one drawn between others, between theirs."""
+    known = {number: one / 1000 for number, one in enumerate(told_ms) if one is not None}
+    if not known:
+        return ()
+    return tuple(np.interp(range(len(told_ms)), list(known), list(known.values())).tolist())
 
 
 def read_long_axis(folder: Path) -> tuple[LongAxis, ...]:

@@ -6,10 +6,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from data_synth.beat import end_systole_phase, kick_onset_phase, warp_phase
 from pipeline.imaging import network
-from pipeline.imaging.inference import blend_phases, settle_tricuspid
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.inference import (
+    PlaneProbability,
+    blend_phases,
+    bring_to_one_axis,
+    settle_tricuspid,
+)
 from pipeline.imaging.labels import LABELS, MUSCLE
 from pipeline.imaging.network import WEIGHTS, predict, read_onnx
+from pipeline.imaging.view import View
 
 
 @pytest.mark.parametrize(("count", "share"), [(25, 0.25), (8, 0.1), (3, 0.2), (2, 0.25)])
@@ -54,6 +62,63 @@ def test_blending_mixes_nothing_across_a_gap_of_the_beat():
     # Elsewhere a cosine loses share^2 (2 - 2 cos(step))^2 of itself.
     kept = 1 - 0.25**2 * (2 - 2 * np.cos(2 * np.pi * 0.04)) ** 2
     np.testing.assert_allclose(blended[2:18] - 2, kept * (value[2:18] - 2), atol=1e-6)
+
+
+def seen_by_slices(phases, rr_s, cycle_rr_s):
+    """A wave ``(phase, slice)`` where the phantom's heart is in each slice's own beat."""
+
+    def landmarks(length_s):
+        rate = 60 / length_s
+        return 0.0, end_systole_phase(rate), kick_onset_phase(rate)
+
+    moments = [
+        [warp_phase(one, landmarks(rr), landmarks(cycle_rr_s)) for rr in rr_s] for one in phases
+    ]
+    return np.cos(2 * np.pi * np.array(moments))
+
+
+def found_in(wave, cine):
+    """Probabilities of three planes a slice, all of one wave, the last slice nearest the apex."""
+    order = tuple(range(wave.shape[1]))[::-1]
+    planes = np.repeat(wave[:, order], 3, axis=1)[..., None, None, None]
+    view = View(np.eye(4), np.eye(3), np.zeros(3), (1, 1), order)
+    return PlaneProbability(np.repeat(planes.astype(np.float32), 2, axis=2), view, 3)
+
+
+def test_slices_of_long_and_short_beats_come_to_the_moments_of_the_mean_beat():
+    """Against the phantom's own law of how systole keeps its length."""
+    phases, rr_s = np.arange(25) / 25, (0.7, 0.8, 0.9, 1.0, 1.1)
+    wave = seen_by_slices(phases, rr_s, 0.9)
+    cine = Cine(np.zeros((25, 5, 1, 1), np.float32), np.eye(4), phases, 0.9, (), rr_s)
+    found = found_in(wave, cine)
+    before = found.value.copy()
+
+    assert bring_to_one_axis(found, cine)
+
+    expected = np.cos(2 * np.pi * phases)[:, None]
+    # Straight lines over steps of 0.04 to 0.06 of the cycle; both laws part by 0.01 of it.
+    allowed = (2 * np.pi * 0.06) ** 2 / 8 + 2 * np.pi * 0.01
+    assert np.abs(found.value[:, :, 0, 0, 0] - expected).max() <= allowed
+    assert np.abs(wave - expected).max() > 4 * allowed
+    np.testing.assert_array_equal(found.value[:, 6:9], before[:, 6:9])
+
+
+@pytest.mark.parametrize(
+    ("phases", "rr_s"),
+    [
+        (np.arange(25) / 25, ()),
+        (np.arange(25) / 25, (0.89, 0.9, 0.9, 0.9, 0.91)),
+        (np.array([0.0, 0.4]), (0.7, 0.8, 0.9, 1.0, 1.1)),
+    ],
+    ids=["not told", "alike", "two phases"],
+)
+def test_slices_stay_as_they_are_where_nothing_is_to_be_moved(phases, rr_s):
+    wave = seen_by_slices(phases, rr_s or (0.9,) * 5, 0.9)
+    cine = Cine(np.zeros((len(phases), 5, 1, 1), np.float32), np.eye(4), phases, 0.9, (), rr_s)
+    found = found_in(wave, cine)
+    before = found.value.copy()
+    bring_to_one_axis(found, cine)
+    np.testing.assert_array_equal(found.value, before)
 
 
 RIGHT = [LABELS["right_atrium"], LABELS["rv_cavity"]]

@@ -300,7 +300,7 @@ def stack_and_views(seed: int, noise: float = 0.05) -> Any:
         own = frame_of(across, np.array([0, 0, 1.0]), np.array([0, 0, 40.0]), 1.0)
         # Another gain and offset: nothing but the pattern is compared.
         image = 3 * image_of(body, own, moved, noise, rng) + 7
-        views.append(Cine(image[:, None].astype(np.float32), turned(own), phases, 0.9))
+        views.append(Cine(image[:, None].astype(np.float32), turned(own), phases, 0.8))
     return cine, views, slices_mm, views_mm
 
 

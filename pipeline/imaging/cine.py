@@ -54,6 +54,9 @@ class Cine:
     """Slices never acquired, or spoilt: the mean of their two neighbours stands in for each. They
     keep the stack evenly spaced; nothing is to be measured on them."""
 
+    slice_rr_s: tuple[float, ...] = ()
+    """RR interval while each slice was acquired; empty where they are not told apart."""
+
     @property
     def spacing_mm(self) -> Float:
         """Distance between voxel centres along the array's ``x, y, z``."""

@@ -22,6 +22,7 @@ from pipeline.imaging.network import (
 )
 from pipeline.imaging.view import View
 from pipeline.progress import Progress
+from pipeline.registration.clock import to_cycle
 
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
@@ -44,6 +45,12 @@ gains up to 0.004 of Dice; the atria, which lie in the other half, would lose by
 
 BRIEF = 12
 """The right atrium reaches a place for longer than this part of a beat: one of so many."""
+
+ONE_MOMENT = 0.01
+"""Share of a beat, some 8 ms, by which slices are at one moment."""
+
+GAP = 0.1
+"""Share of a beat from phase to phase over which walls move by more than their blur."""
 
 LEAST_PASSED = 0.1
 """Where either right chamber is never so probable their valve does not pass."""
@@ -225,6 +232,43 @@ def blend_phases(value: Float32, share: float, phases: Float) -> None:
     for plane in range(value.shape[1]):
         # Plane by plane what is at work stays in the processor's cache.
         _blend(value[:, plane], weights)
+
+
+def bring_to_one_axis(found: PlaneProbability, cine: Cine) -> bool:
+    """Move slices whose beats were longer or shorter to the phases of the mean beat, in place.
+
+    Systole does not stretch as the beat does: at one share of their own RR intervals slices show
+    the heart at different moments of its cycle (`pipeline.registration.clock.to_cycle`). Between
+    its own phases a slice is a mean of the two. Slices less than `ONE_MOMENT` off stay as they
+    are; and phases beside a gap, where that mean would be two hearts.
+
+    Returns
+    -------
+    Whether any was moved.
+    """
+    phases, moved = cine.phases, False
+    for number, z in enumerate(found.view.order if cine.slice_rr_s else ()):
+        seen = to_cycle(phases, cine.slice_rr_s[z], cine.rr_s)
+        if np.abs(seen - phases).max() <= ONE_MOMENT:
+            continue
+        first = number * found.planes_a_slice
+        for plane in range(first, first + found.planes_a_slice):
+            _move(found.value[:, plane], seen, phases)
+        moved = True
+    return moved
+
+
+def _move(value: Float32, seen: Float, phases: Float) -> None:
+    """Bring what was seen at some phases (``(phase,)`` in [0, 1), rising) to others, in place."""
+    count, times = len(seen), np.append(seen, seen[0] + 1)
+    place = np.interp((phases - seen[0]) % 1 + seen[0], times, np.arange(count + 1))
+    low = np.floor(place).astype(int) % count
+    beside_gap = np.diff(times)[low] > GAP
+    share = (place % 1).astype(np.float32)
+    before = value.copy()
+    for phase in np.flatnonzero(~beside_gap):
+        one, other = before[low[phase]], before[(low[phase] + 1) % count]
+        value[phase] = one + share[phase] * (other - one)
 
 
 def _blend(value: Float32, weights: Float32) -> None:

@@ -20,6 +20,7 @@ from pipeline.imaging.faults import require_finite, require_room_for_a_heart
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
+    bring_to_one_axis,
     label_probability,
     settle_tricuspid,
 )
@@ -130,8 +131,10 @@ def segment_cine(
     _require_right_ventricle(drawn)
     crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
     acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
-    heart, heart_mr_from_index = _isotropic(found, drawn, settings, crossings, acquired)
     labels = _on_cine(found, cine)
+    if bring_to_one_axis(found, cine):
+        drawn = _drawn(found)
+    heart, heart_mr_from_index = _isotropic(found, drawn, settings, crossings, acquired)
     stored = np.argsort(found.view.order)
     return Segmentation(
         labels, heart, heart_mr_from_index, confidence[:, stored], place.orientation
