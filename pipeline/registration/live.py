@@ -30,10 +30,10 @@ from pipeline.registration.pose_search import Pivot
 from pipeline.registration.reading import Reader, as_compared
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.similarity import agreement
+from pipeline.registration.similarity import agreement, expansion
 from pipeline.registration.space import Registration
 from pipeline.registration.tissue_map import TissueMap
-from pipeline.registration.uncertainty import curvature_at, rising, sandwich
+from pipeline.registration.uncertainty import STEP_MM, curvature_at, rising, sandwich
 
 # A step of one frame beyond this is no drift but an outlier; it is cut to this length.
 _LONGEST_STEP_MM = 1.0
@@ -162,16 +162,18 @@ class Follower:
     def _update(self, samples: Samples, pose: Float, prior_mm2: Float) -> tuple[Float, Float]:
         """Step and covariance after one frame's loss, expanded about the present pose."""
 
-        def losses(step_mm: Float) -> Float:
-            moved = self.pivot.move(pose, step_mm)
-            return np.log1p(-agreement(samples, self.tissue, moved).explained)
+        def slopes(step_mm: Float) -> Float:
+            moved, arm = self.pivot.move(pose, step_mm), (self.pivot.centre_mm, self.pivot.lever_mm)
+            return np.asarray(expansion(samples, self.tissue, moved, *arm).slopes[0])
 
-        curvature = curvature_at(losses)
+        # How the slopes change is a third of the work of how the losses do, to second order.
+        steps = STEP_MM * np.eye(6)
+        rows = np.array([slopes(step) - slopes(-step) for step in steps]) / (2 * STEP_MM)
         # Where one frame's loss bends the wrong way it says nothing.
-        bending = rising(curvature.bending)
+        bending = rising((rows + rows.T) / 2)
         information = np.linalg.inv(prior_mm2) + self.information_of_loss * bending
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        step = -self.information_of_loss * covariance @ curvature.slopes[0]
+        step = -self.information_of_loss * covariance @ slopes(np.zeros(6))
         length = float(np.linalg.norm(step))
         return step * min(1.0, _LONGEST_STEP_MM / max(length, 1e-12)), covariance
 

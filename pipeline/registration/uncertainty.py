@@ -26,7 +26,7 @@ FrameLosses = Callable[[Float], Float]
 """``(frames,)`` losses, in nats or the like, after a step of six millimetres from the pose."""
 
 # Wide enough to look past the kinks that linear interpolation leaves at every node.
-_STEP_MM = 1.0
+STEP_MM = 1.0
 REACH = 0.25
 """Up to which share of a sweep's frames neighbours count as correlated."""
 # Errors that are drawn to count how many stay small.
@@ -56,7 +56,7 @@ def curvature_at(losses: FrameLosses) -> Curvature:
 def slopes_at(losses: FrameLosses) -> Float:
     """``(frames, 6)`` slopes of each frame's loss by central differences at step zero."""
     ahead, behind = _either_side(losses)
-    return (ahead - behind) / (2 * _STEP_MM)
+    return (ahead - behind) / (2 * STEP_MM)
 
 
 def frame_curvatures(losses: FrameLosses) -> tuple[Float, Float]:
@@ -64,19 +64,19 @@ def frame_curvatures(losses: FrameLosses) -> tuple[Float, Float]:
     ahead, behind = _either_side(losses)
     here = losses(np.zeros(6))
     bending = np.zeros((len(here), 6, 6))
-    steps = _STEP_MM * np.eye(6)
+    steps = STEP_MM * np.eye(6)
     for i in range(6):
         bending[:, i, i] = ahead[:, i] + behind[:, i] - 2 * here
         for j in range(i):
             same = losses(steps[i] + steps[j]) + losses(-steps[i] - steps[j])
             cross = losses(steps[i] - steps[j]) + losses(steps[j] - steps[i])
             bending[:, i, j] = bending[:, j, i] = (same - cross) / 4
-    return (ahead - behind) / (2 * _STEP_MM), bending / _STEP_MM**2
+    return (ahead - behind) / (2 * STEP_MM), bending / STEP_MM**2
 
 
 def _either_side(losses: FrameLosses) -> tuple[Float, Float]:
     """``(frames, 6)`` losses a step ahead along each direction, and behind."""
-    steps = _STEP_MM * np.eye(6)
+    steps = STEP_MM * np.eye(6)
     ahead = np.stack([losses(step) for step in steps], axis=1)
     return ahead, np.stack([losses(-step) for step in steps], axis=1)
 
