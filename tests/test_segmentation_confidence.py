@@ -161,6 +161,11 @@ def test_a_phase_that_shows_nothing_is_named(study):
         segment_cine(replace(images, intensity=intensity), QUICK)
 
 
+def test_images_that_are_all_empty_are_not_to_be_left_out():
+    with pytest.raises(StageError, match="every image are alike; export the images again"):
+        segment_cine(still(0.0), QUICK)
+
+
 def beating(phases=6, slices=5, side=64):
     """A shrinking and growing bright disc in textured surroundings, and its labels' chances."""
     rng = np.random.default_rng(3)

@@ -155,6 +155,10 @@ def _require_contrast(cine: Cine) -> None:
     blank = np.ptp(cine.intensity, axis=(2, 3)) == 0
     if not blank.any():
         return
+    if blank.all():
+        raise StageError(
+            "no heart found: all pixels of every image are alike; export the images again"
+        )
     empty = np.flatnonzero(blank.all(axis=1))
     if len(empty):
         raise StageError(
