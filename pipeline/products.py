@@ -19,6 +19,7 @@ from pipeline.imaging.labels import LABELS
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import LPS_FROM_RAS, read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
+from pipeline.registration.clock import to_cycle
 from pipeline.sealing import PHASE_FILE
 
 
@@ -70,16 +71,24 @@ def read_cine(folder: Path) -> Cine:
         np.array(timing["phases"]),
         float(timing["rr_s"]),
         tuple(timing.get("interpolated_slices", ())),
-        _rr_s_by_slice(timing.get("rr_ms", [])),
+        _moments(timing),
     )
 
 
-def _rr_s_by_slice(told_ms: Sequence[float | None]) -> tuple[float, ...]:
-    """RR interval of every slice; of one drawn between others, between theirs."""
-    known = {number: one / 1000 for number, one in enumerate(told_ms) if one is not None}
+def _moments(timing: Mapping[str, Any]) -> Float | None:
+    """`Cine.moments`; of slices drawn between others, between theirs."""
+    told = list(zip(timing.get("trigger_times_ms", []), timing.get("rr_ms", []), strict=True))
+    known = [number for number, one in enumerate(told) if None not in one]
     if not known:
-        return ()
-    return tuple(np.interp(range(len(told_ms)), list(known), list(known.values())).tolist())
+        return None
+    seen = [
+        to_cycle(
+            np.array(told[number][0]) / told[number][1], told[number][1] / 1000, timing["rr_s"]
+        )
+        for number in known
+    ]
+    columns = [np.interp(range(len(told)), known, column) for column in np.transpose(seen)]
+    return np.stack(columns, axis=1)
 
 
 def read_long_axis(folder: Path) -> tuple[LongAxis, ...]:

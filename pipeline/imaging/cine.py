@@ -54,8 +54,9 @@ class Cine:
     """Slices never acquired, or spoilt: the mean of their two neighbours stands in for each. They
     keep the stack evenly spaced; nothing is to be measured on them."""
 
-    slice_rr_s: tuple[float, ...] = ()
-    """RR interval while each slice was acquired; empty where they are not told apart."""
+    moments: Float | None = None
+    """``(z, phase)`` in [0, 1): where in the mean beat each slice shows the heart, by its own
+    trigger times and RR interval; None where they are not told apart."""
 
     @property
     def spacing_mm(self) -> Float:

@@ -22,7 +22,6 @@ from pipeline.imaging.network import (
 )
 from pipeline.imaging.view import View
 from pipeline.progress import Progress
-from pipeline.registration.clock import to_cycle
 
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
@@ -238,7 +237,7 @@ def bring_to_one_axis(found: PlaneProbability, cine: Cine) -> bool:
     """Move slices whose beats were longer or shorter to the phases of the mean beat, in place.
 
     Systole does not stretch as the beat does: at one share of their own RR intervals slices show
-    the heart at different moments of its cycle (`pipeline.registration.clock.to_cycle`). Between
+    the heart at different moments of its cycle (`Cine.moments`). Between
     its own phases a slice is a mean of the two. Slices less than `ONE_MOMENT` off stay as they
     are; and phases beside a gap, where that mean would be two hearts.
 
@@ -247,9 +246,11 @@ def bring_to_one_axis(found: PlaneProbability, cine: Cine) -> bool:
     Whether any was moved.
     """
     phases, moved = cine.phases, False
-    for number, z in enumerate(found.view.order if cine.slice_rr_s else ()):
-        seen = to_cycle(phases, cine.slice_rr_s[z], cine.rr_s)
-        if np.abs(seen - phases).max() <= ONE_MOMENT:
+    if cine.moments is None:
+        return moved
+    for number, z in enumerate(found.view.order):
+        seen = cine.moments[z]
+        if np.abs(seen - phases).max() <= ONE_MOMENT or (np.diff(seen) <= 0).any():
             continue
         first = number * found.planes_a_slice
         for plane in range(first, first + found.planes_a_slice):

@@ -179,9 +179,9 @@ def _compare(cine: Cine, other: Cine, line: _Line, z: int) -> tuple[Float, Float
     With its covariance ``(3, 3)``; None where they agree nowhere clearly.
     """
     chosen = np.unique(np.linspace(0, len(cine.phases) - 1, MOST_PHASES).round().astype(int))
-    rr_s = cine.slice_rr_s[z] if cine.slice_rr_s else cine.rr_s
+    seen = cine.phases if cine.moments is None else cine.moments[z]
     # Where the view's own beat is as far as the slice's was.
-    theirs = _profiles(other, line, to_cycle(cine.phases[chosen], rr_s, other.rr_s))
+    theirs = _profiles(other, line, to_cycle(seen[chosen], cine.rr_s, other.rr_s))
     ours = _slice_patches(cine, line, z, chosen)
     valid: Mask = np.asarray(np.isfinite(theirs).all(axis=(0, 1)))
     if valid.sum() * STEP_MM < LEAST_LINE_MM or not np.isfinite(ours).all():
