@@ -97,8 +97,14 @@ class Frame:
 
 def slice_positions(frames: Sequence[Frame]) -> Float:
     """Where the slices lie along the first frame's normal, rising, in mm."""
-    along_mm = np.sort([float(frame.middle_mm @ frames[0].normal) for frame in frames])
+    along_mm = np.sort(_along_normal_mm(frames))
     return np.asarray(along_mm[np.diff(along_mm, prepend=-np.inf) > NEAREST_SLICES_MM])
+
+
+def _along_normal_mm(frames: Sequence[Frame]) -> list[float]:
+    """Where each frame lies along the first one's normal."""
+    normal = frames[0].normal
+    return [float(frame.middle_mm @ normal) for frame in frames]
 
 
 def sets_alike(frames: Sequence[Frame]) -> list[list[Frame]]:
@@ -138,8 +144,7 @@ def by_slice(frames: Sequence[Frame]) -> list[list[Frame]]:
     # Half the least distance of two slices: rounded positions fall on the right side.
     starts_mm = slice_positions(frames) - NEAREST_SLICES_MM / 2
     slices: list[list[Frame]] = [[] for _ in starts_mm]
-    for frame in frames:
-        along_mm = float(frame.middle_mm @ frames[0].normal)
+    for frame, along_mm in zip(frames, _along_normal_mm(frames), strict=True):
         slices[int(np.searchsorted(starts_mm, along_mm)) - 1].append(frame)
     return slices
 

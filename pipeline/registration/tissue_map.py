@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from pipeline.compiled import door
 from pipeline.errors import InputError
@@ -94,6 +94,7 @@ def draw_tissue(
     share = np.empty((len(phases), *grid.shape, 3 if beyond or lids else 2), dtype=np.float32)
     seen = CineOnGrid.of(cine, phases, grid) if cine is not None and muscle else None
     grey = None if seen is None else _grey_of_muscle(seen, surfaces, names, grid)
+    wall_nodes = (_WALL_MM / spacing_mm,) * 3
 
     def draw(index: int) -> None:
         covered = {name: coverage(surfaces[name].at(index), grid) for name in names}
@@ -104,14 +105,13 @@ def draw_tissue(
         carried = np.zeros_like(blood)
         for end in beyond:
             carried = np.maximum(carried, end.carried(blood))
-        width = _WALL_MM / spacing_mm
-        soft = gaussian_filter(np.maximum(blood, carried), width, mode="constant")
+        soft = _softened(np.maximum(blood, carried), wall_nodes)
         wall = 4 * soft * (1 - soft)
         if lids:
             above = [_above(lid, surfaces[lid.ventricle].at(index), grid) for lid in lids]
             over = np.maximum(np.max(above, axis=0) - blood, 0)
             # A wall parts blood from tissue, a lid from what is open.
-            tissue = 1 - soft - gaussian_filter(over, width, mode="constant")
+            tissue = 1 - soft - _softened(over, wall_nodes)
             wall = 4 * soft * np.maximum(tissue, 0)
             carried = np.maximum(carried, over)
         for end in beyond:
@@ -194,12 +194,12 @@ def as_seen(tissue: TissueMap) -> TissueMap:
     The logarithm of an echo is not linear in the share of muscle that gives it: where a beam of
     finite width touches a wall, blood looks like muscle already, and cavities look smaller.
     """
-    width = _BEAM_MM / np.array(tissue.grid.spacing_mm[::-1])
+    width = [_BEAM_MM / length_mm for length_mm in tissue.grid.spacing_mm[::-1]]
     share = tissue.share.copy()
 
     def see(index: int) -> None:
         for part in range(0, share.shape[-1], 2):
-            blood = gaussian_filter(tissue.share[index, ..., part], width, mode="constant")
+            blood = _softened(tissue.share[index, ..., part], width)
             dark = np.log(np.maximum(1 - blood, 0) + _ECHO_OF_BLOOD) / np.log(_ECHO_OF_BLOOD)
             share[index, ..., part] = np.clip(dark, 0, 1)
 
@@ -214,12 +214,12 @@ def blurred(tissue: TissueMap, sigma_mm: float) -> TissueMap:
     off by 2 % of a step from blood to wall at most, and what stays fits the processor's cache.
     """
     grid = tissue.grid
-    sigma = sigma_mm / np.array(grid.spacing_mm[::-1])
-    every = max(1, int(0.8 * sigma.min()))
-    kept = tissue.share[:, ::every, ::every, ::every].copy()
+    sigma = [sigma_mm / length_mm for length_mm in grid.spacing_mm[::-1]]
+    every = max(1, int(0.8 * min(sigma)))
+    kept = np.empty_like(tissue.share[:, ::every, ::every, ::every])
 
     def blur(index: int) -> None:
-        soft = gaussian_filter(tissue.share[index], (*sigma, 0), mode="constant", truncate=3)
+        soft = _softened(tissue.share[index], sigma, truncate=3)
         kept[index] = soft[::every, ::every, ::every]
 
     _in_turn(blur, len(kept))
@@ -236,15 +236,42 @@ def coverage(surface: Surface, grid: Grid) -> Float32:
     """
     vertices = (surface.vertices_mm - grid.origin_mm) / np.array(grid.spacing_mm)
     triangles = np.ascontiguousarray(surface.triangles, dtype=np.int64)
-    total = np.zeros(grid.shape, dtype=np.float32)
+    # The last cell that is crossed may be the one after the last vertex; beyond, all is outside.
+    counts = np.array(grid.shape[::-1])
+    first = np.clip(np.floor(vertices.min(axis=0)).astype(int), 0, counts - 1)
+    last = np.clip(np.ceil(vertices.max(axis=0)).astype(int) + 2, first + 1, counts)
+    vertices -= first
+    covered = np.zeros(grid.shape, dtype=np.float32)
+    total = covered[tuple(slice(first[axis], last[axis]) for axis in (2, 1, 0))]
     for turn in range(3):
         # A cyclic order of the axes keeps the triangles' orientation.
         axes = np.roll(np.arange(3), -turn)
-        changes = np.zeros([grid.shape[2 - axis] for axis in axes], dtype=np.float32)
+        changes = np.zeros((last - first)[axes], dtype=np.float32)
         _mark_crossings(np.ascontiguousarray(vertices[:, axes]), triangles, changes)
         inside = np.clip(np.cumsum(changes, axis=0), 0, 1)
         total += inside.transpose([int(np.flatnonzero(axes == axis)[0]) for axis in (2, 1, 0)])
-    return np.asarray(total / 3, dtype=np.float32)
+    total /= 3
+    return covered
+
+
+def _softened(values: Float32, sigma: Sequence[float], truncate: float = 4.0) -> Float32:
+    """``(z, y, x)`` or ``(z, y, x, part)`` values seen through a Gaussian, 0 beyond the grid.
+
+    ``sigma``: standard deviations in nodes along z, y and x; cut off at ``truncate`` of them.
+    """
+    z, y, x = (_gaussian(each, int(truncate * each + 0.5)) for each in sigma)
+    planes = np.stack(
+        [cv2.sepFilter2D(plane, -1, x, y, borderType=cv2.BORDER_CONSTANT) for plane in values]
+    )
+    along = planes.reshape(len(planes), -1)
+    soft = cv2.sepFilter2D(along, -1, np.ones(1), z, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(soft.reshape(values.shape), np.float32)
+
+
+def _gaussian(sigma: float, reach: int) -> Float:
+    """``(2 reach + 1,)`` weights that sum to 1."""
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.asarray(weights / weights.sum())
 
 
 def _grid_around(
