@@ -9,7 +9,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from numba import config, njit
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import config, njit, types
+from numba.extending import intrinsic
 
 from pipeline.caches import is_writable, own_caches, place_of_this_run
 
@@ -45,6 +47,22 @@ def door(folder: Path, names: Sequence[str], **options: Any) -> Callable[[Any], 
             return njit(**options)(function)
 
     return compiled
+
+
+@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
+def fetch(typing_context: Any, address: Any) -> Any:
+    """Bring the line at an address into the outer cache, without waiting for it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, whole, whole, whole])
+        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
+        # To be read; not into the innermost cache, which is too small for it; as data.
+        hints = [ir.Constant(whole, n) for n in (0, 2, 1)]
+        builder.call(prefetch, [builder.inttoptr(arguments[0], pointer), *hints])
+        return context.get_dummy_value()
+
+    return types.void(types.uintp), generate
 
 
 @cache

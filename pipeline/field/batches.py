@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.compiled import fetch
 from pipeline.field import kernels
 from pipeline.geometry import Float
 
@@ -28,7 +29,6 @@ _LINE = 64
 _MANY_LINES = 16
 
 _spline_at, _felt_at, _moment_of = kernels.spline_at, kernels.felt_at, kernels.moment_of
-_fetch = kernels.fetch
 _asked, _inner = kernels.asked, kernels.inner
 
 
@@ -108,7 +108,7 @@ def answer(addresses, line, grid, ends, notes):  # type: ignore[no-untyped-def]
             if each <= np.uintp(_MANY_LINES):
                 stop = min(at + each * np.uintp(_LINE), end)
                 while at < stop:
-                    _fetch(at)
+                    fetch(at)
                     at += np.uintp(_LINE)
             notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3] = _spline_at(
                 addresses, line, grid, notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3]
@@ -127,7 +127,7 @@ def answer_force(law, ends, notes):  # type: ignore[no-untyped-def]
             if each <= np.uintp(_MANY_LINES):
                 stop = min(at + each * np.uintp(_LINE), end)
                 while at < stop:
-                    _fetch(at)
+                    fetch(at)
                     at += np.uintp(_LINE)
             notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3] = _felt_at(
                 law, notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3]

@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-from pipeline.compiled import door
+from pipeline.compiled import door, fetch
 from pipeline.field import potential as formulas
 
 # The compiled code calls the very functions that NumPy users call.
@@ -39,7 +39,7 @@ ASKED: dict[str, Any] = {
 # No way in from Python, which would be compiled too.
 INNER = {**ASKED, "no_cpython_wrapper": True}
 
-_SOURCES = ("potential", "kernels", "batches", "tool_kernels")
+_SOURCES = ("potential", "kernels", "batches", "tool_kernels", "../compiled")
 
 
 asked = door(Path(__file__).parent, _SOURCES, **ASKED)
@@ -200,22 +200,6 @@ def spline_at(addresses, line, grid, x_mm, y_mm, z_mm, phase):  # type: ignore[n
     rows = (k0 + j0, k0 + j1, k0 + j2, k1 + j0, k1 + j1, k1 + j2, k2 + j0, k2 + j1, k2 + j2)
     value, gx, gy, gz = _sum((p0, addresses[k], p2), rows, time + wx + wy + wz + sx + sy + sz)
     return value, gx * grid[9], gy * grid[10], gz * grid[11]
-
-
-@intrinsic  # type: ignore[untyped-decorator]  # numba has no types
-def fetch(typing_context: Any, address: Any) -> Any:
-    """Bring the line at an address into the outer cache, without waiting for it."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, whole, whole, whole])
-        prefetch = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        # To be read; not into the innermost cache, which is too small for it; as data.
-        hints = [ir.Constant(whole, n) for n in (0, 2, 1)]
-        builder.call(prefetch, [builder.inttoptr(arguments[0], pointer), *hints])
-        return context.get_dummy_value()
-
-    return types.void(types.uintp), generate
 
 
 @inner

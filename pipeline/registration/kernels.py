@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
-from numba import njit
+
+from pipeline.compiled import door, fetch
 
 PARTS = 3
 """What the model is made of: blood, its walls, and, where the images end inside a chamber, blood
-carried on; a model without that has two."""
+carried on; a model without that has two, and nothing is added up for the third."""
 
-SUMS = 10
-"""Per frame: grey with each of the parts; blood with each, wall with wall and with what is carried
-on, that with itself; and the sum of blood and wall."""
+SUMS = 1 + PARTS + 1
+"""What a part is multiplied with and added up: grey, each of the parts, and 1."""
+
+PUSHES = 1 + PARTS + 6
+"""What a change of the fitted picture is multiplied with and added up: grey, each of the parts, and
+each of the six changes."""
+
+# Samples that are asked for before the first is looked up: the model is too large for a processor's
+# own caches, and the way to memory takes longer than all else. Whole fours.
+_TILE = 64
+
+_compiled = door(Path(__file__).parent, ("kernels", "../compiled"), nogil=True, cache=True)
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def add_up(  # type: ignore[no-untyped-def]
     points,
     grey,
@@ -31,12 +42,20 @@ def add_up(  # type: ignore[no-untyped-def]
     sums,
     with_trend,
 ):
-    """Per frame: products of the shares with grey, trend and each other, and their own sum."""
+    """Per frame: products of the parts with grey, each other and 1 (``sums``), and with the trend.
+
+    Frames of one geometry are taken tile by tile: the trend is read once for all of them.
+    """
     phases, depth, height, width, parts = share.shape
     m = index_from_tracker
-    for f in range(len(first) - 1):
-        before, after, late = lower[f], (lower[f] + 1) % phases, weight[f]
-        for s in range(first[f], first[f + 1]):
+    shares, beside = np.zeros((parts, _TILE), np.float32), np.zeros((_TILE, SUMS), np.float32)
+    beside[:, SUMS - 1] = 1
+    rows, every = np.zeros(_TILE, np.int64), np.arange(_TILE)
+    for f, start in _tiles(first, trend_row):
+        before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
+        count, stop = 0, min(start + _TILE, first[f + 1])
+        _ask_for(share, before, after, points, start, stop, m, shift[f])
+        for s in range(start, stop):
             px, py, pz = points[s, 0], points[s, 1], points[s, 2]
             x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[f, 0]
             y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[f, 1]
@@ -48,20 +67,85 @@ def add_up(  # type: ignore[no-untyped-def]
                 blood_late, wall_late = _interpolate(share, after, k, j, i, w, v, u)
                 blood += late * (blood_late - blood)
                 wall += late * (wall_late - wall)
-                row = trend[trend_row[f] + s - first[f]]
-                if blood > 0 or wall > 0:
-                    _accumulate(sums[f], with_trend[f], blood, wall, grey[s], row)
+                carried = np.float32(0)
                 if parts > 2:
-                    near = np.float32(u), np.float32(v), np.float32(w)
-                    late32 = np.float32(late)
-                    carried = _carried(share, before, after, late32, k, j, i, near)[0]
-                    if carried > 0:
-                        _accumulate_carried(
-                            sums[f], with_trend[f], blood, wall, carried, grey[s], row
-                        )
+                    carried = _carried(share, before, after, late, k, j, i, (u, v, w))[0]
+                    shares[2, count] = carried
+                shares[0, count], shares[1, count] = blood, wall
+                beside[count, 0], beside[count, 1] = grey[s], blood
+                beside[count, 2], beside[count, 3] = wall, carried
+                rows[count] = trend_row[f] + s - first[f]
+                if blood > 0 or wall > 0 or carried > 0:
+                    count += 1
+        if count > 0:
+            _fill_up(shares, rows, count)
+            _multiply(sums[f], shares, count, beside, every)
+            _multiply(with_trend[f], shares, count, trend, rows)
 
 
-@njit(cache=True, nogil=True)
+@_compiled
+def _tiles(first, trend_row):  # type: ignore[no-untyped-def]
+    """Each frame's tiles by their first sample; of frames with one trend, all first tiles first."""
+    begin = 0
+    while begin < len(trend_row):
+        end = begin + 1
+        while end < len(trend_row) and trend_row[end] == trend_row[begin]:
+            end += 1
+        for passed in range(0, first[begin + 1] - first[begin], _TILE):
+            for f in range(begin, end):
+                yield f, first[f] + passed
+        begin = end
+
+
+@_compiled
+def _ask_for(share, before, after, points, start, stop, m, shift):  # type: ignore[no-untyped-def]
+    """Have what the model holds around samples brought, in two phases."""
+    _, depth, height, width, parts = share.shape
+    address, size = np.uintp(share.ctypes.data), parts * share.itemsize
+    early, late = before * depth * height * width, after * depth * height * width
+    for s in range(start, stop):
+        px, py, pz = points[s, 0], points[s, 1], points[s, 2]
+        x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[0]
+        y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[1]
+        z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[2]
+        if 0 <= x < width - 1 and 0 <= y < height - 1 and 0 <= z < depth - 1:
+            for k in range(int(z), int(z) + 2):
+                for j in range(int(y), int(y) + 2):
+                    node = (k * height + j) * width + int(x)
+                    fetch(address + np.uintp(size * (early + node)))
+                    fetch(address + np.uintp(size * (late + node)))
+
+
+@_compiled
+def _fill_up(values, rows, count):  # type: ignore[no-untyped-def]
+    """Make ``count`` samples of a tile whole fours, the last of no weight."""
+    whole = (count + 3) // 4 * 4
+    values[:, count:whole] = 0
+    rows[count:whole] = rows[count - 1]
+
+
+@_compiled
+def _multiply(sums, values, count, table, rows):  # type: ignore[no-untyped-def]
+    """Add the products of a tile's values with rows of a table, four samples at a time.
+
+    Sums over one tile are short enough for single precision.
+    """
+    columns = table.shape[1]
+    tile = np.empty(columns, np.float32)
+    for v in range(len(values)):
+        tile[:] = 0
+        for n in range(0, count, 4):
+            a, b, c, d = values[v, n], values[v, n + 1], values[v, n + 2], values[v, n + 3]
+            row_a, row_b, row_c, row_d = rows[n], rows[n + 1], rows[n + 2], rows[n + 3]
+            for column in range(columns):
+                tile[column] += (a * table[row_a, column] + b * table[row_b, column]) + (
+                    c * table[row_c, column] + d * table[row_d, column]
+                )
+        for column in range(columns):
+            sums[v, column] += tile[column]
+
+
+@_compiled
 def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def]
     """Trilinear blood and wall in one phase."""
     blood, wall = np.float32(0), np.float32(0)
@@ -77,32 +161,7 @@ def _interpolate(share, phase, k, j, i, w, v, u):  # type: ignore[no-untyped-def
     return blood, wall
 
 
-@njit(cache=True, nogil=True)
-def _accumulate(sums, with_trend, blood, wall, grey, trend):  # type: ignore[no-untyped-def]
-    """Add one sample's blood and wall to a frame's sums."""
-    sums[0] += blood * grey
-    sums[1] += wall * grey
-    sums[3] += blood * blood
-    sums[4] += blood * wall
-    sums[6] += wall * wall
-    sums[9] += blood + wall
-    for c in range(len(trend)):
-        with_trend[0, c] += blood * trend[c]
-        with_trend[1, c] += wall * trend[c]
-
-
-@njit(cache=True, nogil=True)
-def _accumulate_carried(sums, with_trend, blood, wall, carried, grey, trend):  # type: ignore[no-untyped-def]
-    """Add what is carried on at one sample to a frame's sums."""
-    sums[2] += carried * grey
-    sums[5] += blood * carried
-    sums[7] += wall * carried
-    sums[8] += carried * carried
-    for c in range(len(trend)):
-        with_trend[2, c] += carried * trend[c]
-
-
-@njit(cache=True, nogil=True)
+@_compiled
 def bend(  # type: ignore[no-untyped-def]
     points,
     grey,
@@ -119,17 +178,19 @@ def bend(  # type: ignore[no-untyped-def]
     centre,
     turn,
     pushes,
-    squares,
     with_trend,
 ):
-    """Per frame: products of the fitted picture's six changes with a step of the pose with grey
-    and the model's parts (``pushes``), with each other, and with the trend."""
+    """Per frame: products of the fitted picture's six changes with a step of the pose with grey,
+    the model's parts and each other (``pushes``), and with the trend; in tiles as `add_up`."""
     phases, depth, height, width, parts = share.shape
     m = index_from_tracker
-    change = np.zeros(6)
-    for f in range(len(first) - 1):
+    changes, beside = np.zeros((6, _TILE), np.float32), np.zeros((_TILE, PUSHES), np.float32)
+    rows, every = np.zeros(_TILE, np.int64), np.arange(_TILE)
+    for f, start in _tiles(first, trend_row):
         before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
-        for s in range(first[f], first[f + 1]):
+        count, stop = 0, min(start + _TILE, first[f + 1])
+        _ask_for(share, before, after, points, start, stop, m, shift[f])
+        for s in range(start, stop):
             px, py, pz = points[s, 0], points[s, 1], points[s, 2]
             x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
             y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
@@ -149,30 +210,30 @@ def bend(  # type: ignore[no-untyped-def]
                     slope_x += coefficients[f, 2] * rise_x
                     slope_y += coefficients[f, 2] * rise_y
                     slope_z += coefficients[f, 2] * rise_z
+                slope_x /= spacing_mm[0]
+                slope_y /= spacing_mm[1]
+                slope_z /= spacing_mm[2]
+                ax = (x - centre[0]) * spacing_mm[0] * turn
+                ay = (y - centre[1]) * spacing_mm[1] * turn
+                az = (z - centre[2]) * spacing_mm[2] * turn
+                changes[0, count], changes[1, count] = slope_x, slope_y
+                changes[2, count] = slope_z
+                changes[3, count] = ay * slope_z - az * slope_y
+                changes[4, count] = az * slope_x - ax * slope_z
+                changes[5, count] = ax * slope_y - ay * slope_x
+                beside[count, 0], beside[count, 1] = grey[s], blood
+                beside[count, 2], beside[count, 3] = wall, carried
+                beside[count, 1 + PARTS :] = changes[:, count]
+                rows[count] = trend_row[f] + s - first[f]
                 if blood > 0 or wall > 0 or carried > 0:
-                    change[0] = slope_x / spacing_mm[0]
-                    change[1] = slope_y / spacing_mm[1]
-                    change[2] = slope_z / spacing_mm[2]
-                    ax = (x - centre[0]) * spacing_mm[0] * turn
-                    ay = (y - centre[1]) * spacing_mm[1] * turn
-                    az = (z - centre[2]) * spacing_mm[2] * turn
-                    change[3] = ay * change[2] - az * change[1]
-                    change[4] = az * change[0] - ax * change[2]
-                    change[5] = ax * change[1] - ay * change[0]
-                    row = trend[trend_row[f] + s - first[f]]
-                    for a in range(6):
-                        pushes[f, 0, a] += change[a] * grey[s]
-                        pushes[f, 1, a] += change[a] * blood
-                        pushes[f, 2, a] += change[a] * wall
-                        if parts > 2:
-                            pushes[f, 3, a] += change[a] * carried
-                        for b in range(6):
-                            squares[f, a, b] += change[a] * change[b]
-                        for c in range(len(row)):
-                            with_trend[f, a, c] += change[a] * row[c]
+                    count += 1
+        if count > 0:
+            _fill_up(changes, rows, count)
+            _multiply(pushes[f], changes, count, beside, every)
+            _multiply(with_trend[f], changes, count, trend, rows)
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _slope(share, before, after, late, k, j, i, near, coefficients):  # type: ignore[no-untyped-def]
     """Trilinear blood and wall between two phases, and the slope of their sum under the
     coefficients, a node, along x, y and z."""
@@ -199,7 +260,7 @@ def _slope(share, before, after, late, k, j, i, near, coefficients):  # type: ig
     return blood, wall, slope_x, slope_y, slope_z
 
 
-@njit(cache=True, nogil=True)
+@_compiled
 def _carried(share, before, after, late, k, j, i, near):  # type: ignore[no-untyped-def]
     """What is carried on between two phases, trilinear, and its slope, a node, along x, y and z."""
     x, y, z = near

@@ -21,14 +21,12 @@ import numpy as np
 from pipeline.field.threads import shared
 from pipeline.geometry import Float, Integer, Mask
 from pipeline.registration.frames import Samples
-from pipeline.registration.kernels import PARTS, SUMS, add_up, bend
+from pipeline.registration.kernels import PARTS, PUSHES, SUMS, add_up, bend
 from pipeline.registration.tissue_map import TissueMap
 
 # Grey values of variance 1 explained by less than this say nothing: it keeps the fit solvable
 # where a frame misses the heart.
 _RIDGE = 1e-3
-# Where products of two parts stand among the sums.
-_PRODUCTS = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
 # Fewer samples are added up before another thread would have started.
 _THREADS, _SAMPLES_A_THREAD = 2, 16_384
 
@@ -80,7 +78,7 @@ def agreement(
         ``(frames, 3)`` LPS: how much further each frame lies in the model; nothing if None.
     """
     fit = _fitted(samples, tissue, _Place.of(samples, tissue, mr_from_tracker, shift_mm))
-    return Agreement(fit.explained, fit.sums[:, -1] / np.diff(samples.first))
+    return Agreement(fit.explained, fit.sums[:, :2, -1].sum(axis=1) / np.diff(samples.first))
 
 
 def expansion(
@@ -107,16 +105,16 @@ def expansion(
     frames = samples.frames
     coefficients, spacing_mm = fit.coefficients.astype(np.float32), np.array(tissue.grid.spacing_mm)
     centre = (np.asarray(centre_mm) - tissue.grid.origin_mm) / spacing_mm
-    pushes, squares = np.zeros((frames, 1 + PARTS, 6)), np.zeros((frames, 6, 6))
+    pushes = np.zeros((frames, 6, PUSHES))
     with_trend = np.zeros((frames, 6, samples.trend.shape[1]))
 
     def add(some: slice) -> None:
         arms = coefficients[some], spacing_mm, centre, 1 / lever_mm
-        sums = pushes[some], squares[some], with_trend[some]
+        sums = pushes[some], with_trend[some]
         bend(*_looked_at(samples, tissue, place, some), *arms, *sums)
 
     _in_parts(add, samples)
-    return _expanded(fit, np.diff(samples.first), pushes, squares, with_trend)
+    return _expanded(fit, np.diff(samples.first), pushes, with_trend)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +164,7 @@ class _Fit:
     """``(frames, parts)``: which are fitted."""
 
     sums: Float
-    """``(frames, SUMS)``."""
+    """``(frames, parts, SUMS)``."""
 
     with_trend: Float
     """``(frames, parts, columns)``."""
@@ -195,7 +193,7 @@ def _in_parts(add: Callable[[slice], None], samples: Samples) -> None:
 
 
 def _fitted(samples: Samples, tissue: TissueMap, place: _Place) -> _Fit:
-    sums = np.zeros((samples.frames, SUMS))
+    sums = np.zeros((samples.frames, PARTS, SUMS))
     with_trend = np.zeros((samples.frames, PARTS, samples.trend.shape[1]))
 
     def add(some: slice) -> None:
@@ -217,8 +215,8 @@ def _neighbours(phases: Float, stored: Float) -> tuple[Integer, Float]:
 
 def _explained(sums: Float, with_trend: Float, counts: Integer) -> _Fit:
     """Variance explained by the model's parts beyond the trend, blood darker than the rest."""
-    grey = sums[:, :PARTS]
-    normal = sums[:, _PRODUCTS] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
+    grey = sums[..., 0]
+    normal = sums[..., 1:-1] - np.einsum("fct,fdt->fcd", with_trend, with_trend)
     normal[:, range(PARTS), range(PARTS)] += _RIDGE * counts[:, None]
     fitted, every = np.ones(grey.shape, dtype=bool), normal
     # Two parts may be left out, one after the other; the last solution leaves out none.
@@ -232,13 +230,12 @@ def _explained(sums: Float, with_trend: Float, counts: Integer) -> _Fit:
     return _Fit(explained, coefficients, normal, fitted, sums, with_trend)
 
 
-def _expanded(
-    fit: _Fit, counts: Integer, pushes: Float, squares: Float, with_trend: Float
-) -> Expansion:
+def _expanded(fit: _Fit, counts: Integer, pushes: Float, with_trend: Float) -> Expansion:
     """Slopes and curvature from what `bend` has added up."""
+    grey, parts, squares = pushes[..., 0], pushes[..., 1 : 1 + PARTS], pushes[..., 1 + PARTS :]
     # What the parts change where the trend is taken out of them.
-    beyond = pushes[:, 1:] - np.einsum("fit,fct->fci", with_trend, fit.with_trend)
-    rest = pushes[:, 0] - np.einsum("fc,fci->fi", fit.coefficients, beyond)
+    beyond = parts.swapaxes(1, 2) - np.einsum("fit,fct->fci", with_trend, fit.with_trend)
+    rest = grey - np.einsum("fc,fci->fi", fit.coefficients, beyond)
     bent = squares - np.einsum("fit,fjt->fij", with_trend, with_trend)
     beyond = np.where(fit.fitted[..., None], beyond, 0)
     bent -= np.einsum("fci,fcj->fij", beyond, np.linalg.solve(fit.normal, beyond))
