@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -217,11 +218,26 @@ def lattice_of(
     """
     pixel_mm = pixel_size_mm(sweep)
     sector = sector_of(sweep)
-    at = _lattice(sector, pixel_mm, spacing_mm)
-    smoothing = _smoothing(sector, at, pixel_mm, smoothing_mm)
-    trend = _trend(at * pixel_mm, trend_mm)
+    lengths_mm = float(pixel_mm[0]), float(pixel_mm[1]), spacing_mm, smoothing_mm, trend_mm
+    places = _places_in(sector.tobytes(), sector.shape, *lengths_mm)
     contact = None if isinstance(sweep, BloodSweep) else Contact.of(sector, pixel_mm)
-    return Lattice(at, smoothing, trend, float(sweep.images.max()), contact)
+    return Lattice(*places, float(sweep.images.max()), contact)
+
+
+@lru_cache(maxsize=8)
+def _places_in(
+    sector: bytes,
+    shape: tuple[int, int],
+    width_mm: float,
+    height_mm: float,
+    spacing_mm: float,
+    smoothing_mm: float,
+    trend_mm: float,
+) -> tuple[Integer, csr_array, Float]:
+    """The first three parts of a `Lattice`; a study's sweeps, looked at often, share few."""
+    shown, pixel_mm = np.frombuffer(sector, bool).reshape(shape), np.array([width_mm, height_mm])
+    at = _lattice(shown, pixel_mm, spacing_mm)
+    return at, _smoothing(shown, at, pixel_mm, smoothing_mm), _trend(at * pixel_mm, trend_mm)
 
 
 def sample_pictures(
