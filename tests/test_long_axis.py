@@ -252,7 +252,8 @@ class Body:
         centres_mm = self.centres_mm + np.sin(2 * np.pi * phase) * self.swing_mm
         total = np.zeros(points_mm.shape[:-1])
         for centre, width, height in zip(centres_mm, self.widths_mm, self.heights, strict=True):
-            squares = np.square(points_mm - centre).sum(axis=-1)
+            away_mm = points_mm - centre
+            squares = np.einsum("...i,...i->...", away_mm, away_mm)
             total += height * np.exp(-squares / (2 * width**2))
         return total
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -45,8 +46,6 @@ class Motion:
     @classmethod
     def of(cls, moving: BeatingSurface) -> Self | None:
         """The motion; None where vertices do not correspond or phases are fewer than three."""
-        from scipy.interpolate import make_interp_spline
-
         count = len(moving.phases)
         each = [moving.at(index) for index in range(count)]
         first = each[0]
@@ -56,16 +55,26 @@ class Motion:
         )
         if not same or count < 3:
             return None
-        order = 5 if count >= 8 else 3
-        # SciPy solves one right-hand side after another: a spline for each phase is far fewer than
-        # one for each coordinate.
-        phases, one_by_one = _led_across_gaps(np.append(moving.phases, moving.phases[0] + 1))
-        weights = make_interp_spline(phases, one_by_one, k=order, bc_type="periodic")
+        weights = _weights_at(tuple(moving.phases.tolist()))
         return cls(weights, np.stack([one.vertices_mm for one in each]), first.triangles)
 
     def at(self, phase: float) -> Surface:
         """The surface at any phase."""
         return Surface(np.tensordot(self.weights(phase), self.places_mm, 1), self.triangles)
+
+
+@lru_cache(maxsize=16)
+def _weights_at(phases: tuple[float, ...]) -> Any:
+    """The periodic spline of each phase's weight; a heart's surfaces have their phases in common.
+
+    SciPy solves one right-hand side after another: a spline for each phase is far fewer than one
+    for each coordinate.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    order = 5 if len(phases) >= 8 else 3
+    stored, one_by_one = _led_across_gaps(np.array([*phases, phases[0] + 1]))
+    return make_interp_spline(stored, one_by_one, k=order, bc_type="periodic")
 
 
 def _led_across_gaps(phases: Float) -> tuple[Float, Float]:
