@@ -54,6 +54,24 @@ def test_an_island_is_taken_away_and_the_body_left():
     np.testing.assert_array_equal(cleaned(heart), np.stack([ring()] * 3))
 
 
+def test_what_takes_over_from_an_island_may_be_no_island_either():
+    """Beside the left atrium: right ventricle, else atrium, else muscle, else cavity; none can."""
+    right_atrium, chances = 5, (0.4, 0.3, 0.15, 0.1)
+    heart = np.stack([ring()] * 3)
+    heart[:, 24:40, 54:62] = ATRIUM
+    heart[:, 8:14, 24:40] = RV
+    heart[:, 50:56, 24:40] = right_atrium
+    soft = one_hot(heart)
+    island = np.s_[:, :, 40:44, 58:62]
+    soft[island] = 0.05 / 3
+    for value, chance in zip((RV, right_atrium, MUSCLE, CAVITY), chances, strict=True):
+        soft[:, value, 40:44, 58:62] = chance
+    found = clean_probability(soft, pixel_mm=PIXEL_MM).argmax(axis=1)
+    assert not np.isin(found[:, 40:44, 58:62], (RV, right_atrium, MUSCLE, CAVITY)).any()
+    heart[:, 40:44, 58:62] = found[:, 40:44, 58:62]
+    np.testing.assert_array_equal(found, heart)
+
+
 def test_papillary_muscles_are_drawn_inside_the_cavity():
     smooth = np.stack([ring()] * 3)
     heart = smooth.copy()

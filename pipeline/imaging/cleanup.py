@@ -171,13 +171,16 @@ def _largest_body(mask: Mask) -> Mask:
 
 def _keep_bodies(part: Float32) -> None:
     """Take every structure's probability outside its largest body, in place."""
-    labels = most_probable(part)
-    for value in LABELS.values():
+    labels, unsettled = most_probable(part), set(LABELS.values())
+    while unsettled:
+        unsettled.remove(value := min(unsettled))
         mask = labels == value
         beside = mask & ~_largest_body(mask)
         if beside.any():
             part[:, value] *= ~beside
             labels[beside] = part.transpose(0, 2, 3, 1)[beside].argmax(axis=-1)
+            # What takes over may be an island, too.
+            unsettled.update(set(np.unique(labels[beside]).tolist()) & set(LABELS.values()))
 
 
 def _keep_ringed(part: Float32) -> None:
