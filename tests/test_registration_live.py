@@ -16,7 +16,7 @@ from ellipsoid_heart import (
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
-from pipeline.registration.live import information_of, prepare_follower
+from pipeline.registration.live import LOST_AFTER, information_of, prepare_follower
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
 
@@ -95,6 +95,56 @@ def test_frame_of_something_else_changes_nothing_but_the_certainty(prepared, lat
         assert np.array_equal(drift.state.mr_from_tracker, state.mr_from_tracker)
         before, after = (np.diag(one.covariance_mm2) for one in (state, drift.state))
         assert (after > before).all()
+
+
+def test_a_pose_that_left_the_frames_optimum_is_lost_until_they_agree_again(prepared, later):
+    """A tracker that jumps by 40 mm: nothing leads back from there, and the state says so."""
+    follower, state, lattices, _ = prepared
+    jump = np.eye(4)
+    jump[:3, 3] = (0, 40, 0)
+    first = next(k for k, (_, image, *_) in enumerate(later) if image.any())
+    for count in range(1, LOST_AFTER + 3):
+        sweep, image, pose, phase, _ = later[first + count % 8]
+        drift = follower.follow(state, lattices[sweep], image, jump @ pose, phase)
+        state = drift.state
+        assert not drift.used
+        assert state.lost == (count >= LOST_AFTER)
+    # A probe in air says nothing of the pose, neither for it nor against it.
+    state = follower.follow(state, lattices[sweep], 0 * image, pose, phase).state
+    assert state.lost
+    found = [follower.follow(state, lattices[later[k][0]], *later[k][1:4]) for k in range(4)]
+    assert any(one.used for one in found)
+    assert all(one.used != one.state.lost for one in found)
+
+
+def test_a_frozen_picture_counts_once(prepared, later):
+    follower, state, lattices, _ = prepared
+    frames = iter(later)
+    drift = None
+    while drift is None or not drift.used:
+        sweep, image, pose, phase, _ = next(frames)
+        drift = follower.follow(state, lattices[sweep], image, pose, phase)
+    again = follower.follow(drift.state, lattices[sweep], image.copy(), pose, phase)
+    assert not again.used
+    assert np.array_equal(again.state.mr_from_tracker, drift.state.mr_from_tracker)
+    assert again.state.astray == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda image, pose: (image[:-1], pose), "of its sweep's size"),
+        (lambda image, pose: (np.stack([image] * 3, axis=-1), pose), "of its sweep's size"),
+        (lambda image, pose: (image, pose[:3]), "must be a 4x4 transform"),
+        (lambda image, pose: (image, pose * [[1], [1], [1], [0]]), "0 0 0 1 for its last row"),
+    ],
+    ids=["shorter", "colour", "three rows", "no last row"],
+)
+def test_what_is_no_frame_of_the_sweep_is_refused(prepared, later, change, said):
+    follower, state, lattices, _ = prepared
+    sweep, image, pose, phase, _ = later[0]
+    with pytest.raises(InputError, match=said):
+        follower.follow(state, lattices[sweep], *change(image, pose), phase)
 
 
 def test_frames_never_tell_what_all_of_them_share(prepared, later):

@@ -49,9 +49,10 @@ def add_up(  # type: ignore[no-untyped-def]
     phases, depth, height, width, parts = share.shape
     m = index_from_tracker
     shares, beside = np.zeros((parts, _TILE), np.float32), np.zeros((_TILE, SUMS), np.float32)
-    beside[:, SUMS - 1] = 1
     rows, every = np.zeros(_TILE, np.int64), np.arange(_TILE)
-    for f, start in _tiles(first, trend_row):
+    tiles = _tiles(first, trend_row)
+    for number in range(len(tiles)):
+        f, start = tiles[number, 0], tiles[number, 1]
         before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
         count, stop = 0, min(start + _TILE, first[f + 1])
         _ask_for(share, before, after, points, start, stop, m, shift[f])
@@ -73,7 +74,7 @@ def add_up(  # type: ignore[no-untyped-def]
                     shares[2, count] = carried
                 shares[0, count], shares[1, count] = blood, wall
                 beside[count, 0], beside[count, 1] = grey[s], blood
-                beside[count, 2], beside[count, 3] = wall, carried
+                beside[count, 2], beside[count, 3], beside[count, 4] = wall, carried, 1
                 rows[count] = trend_row[f] + s - first[f]
                 if blood > 0 or wall > 0 or carried > 0:
                     count += 1
@@ -85,16 +86,21 @@ def add_up(  # type: ignore[no-untyped-def]
 
 @_compiled
 def _tiles(first, trend_row):  # type: ignore[no-untyped-def]
-    """Each frame's tiles by their first sample; of frames with one trend, all first tiles first."""
-    begin = 0
-    while begin < len(trend_row):
+    """Frame and first sample of every tile; of frames with one trend, all first tiles first."""
+    frames, most, count, begin = len(trend_row), 0, 0, 0
+    for f in range(frames):
+        most += (first[f + 1] - first[f] + _TILE - 1) // _TILE
+    tiles = np.empty((most, 2), np.int64)
+    while begin < frames:
         end = begin + 1
-        while end < len(trend_row) and trend_row[end] == trend_row[begin]:
+        while end < frames and trend_row[end] == trend_row[begin]:
             end += 1
         for passed in range(0, first[begin + 1] - first[begin], _TILE):
             for f in range(begin, end):
-                yield f, first[f] + passed
+                tiles[count, 0], tiles[count, 1] = f, first[f] + passed
+                count += 1
         begin = end
+    return tiles
 
 
 @_compiled
@@ -119,9 +125,10 @@ def _ask_for(share, before, after, points, start, stop, m, shift):  # type: igno
 @_compiled
 def _fill_up(values, rows, count):  # type: ignore[no-untyped-def]
     """Make ``count`` samples of a tile whole fours, the last of no weight."""
-    whole = (count + 3) // 4 * 4
-    values[:, count:whole] = 0
-    rows[count:whole] = rows[count - 1]
+    for n in range(count, (count + 3) // 4 * 4):
+        rows[n] = rows[count - 1]
+        for v in range(len(values)):
+            values[v, n] = 0
 
 
 @_compiled
@@ -133,7 +140,8 @@ def _multiply(sums, values, count, table, rows):  # type: ignore[no-untyped-def]
     columns = table.shape[1]
     tile = np.empty(columns, np.float32)
     for v in range(len(values)):
-        tile[:] = 0
+        for column in range(columns):
+            tile[column] = 0
         for n in range(0, count, 4):
             a, b, c, d = values[v, n], values[v, n + 1], values[v, n + 2], values[v, n + 3]
             row_a, row_b, row_c, row_d = rows[n], rows[n + 1], rows[n + 2], rows[n + 3]
@@ -186,7 +194,9 @@ def bend(  # type: ignore[no-untyped-def]
     m = index_from_tracker
     changes, beside = np.zeros((6, _TILE), np.float32), np.zeros((_TILE, PUSHES), np.float32)
     rows, every = np.zeros(_TILE, np.int64), np.arange(_TILE)
-    for f, start in _tiles(first, trend_row):
+    tiles = _tiles(first, trend_row)
+    for number in range(len(tiles)):
+        f, start = tiles[number, 0], tiles[number, 1]
         before, after, late = lower[f], (lower[f] + 1) % phases, np.float32(weight[f])
         count, stop = 0, min(start + _TILE, first[f + 1])
         _ask_for(share, before, after, points, start, stop, m, shift[f])
@@ -223,7 +233,8 @@ def bend(  # type: ignore[no-untyped-def]
                 changes[5, count] = ax * slope_y - ay * slope_x
                 beside[count, 0], beside[count, 1] = grey[s], blood
                 beside[count, 2], beside[count, 3] = wall, carried
-                beside[count, 1 + PARTS :] = changes[:, count]
+                for change in range(6):
+                    beside[count, 1 + PARTS + change] = changes[change, count]
                 rows[count] = trend_row[f] + s - first[f]
                 if blood > 0 or wall > 0 or carried > 0:
                     count += 1

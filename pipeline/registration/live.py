@@ -11,6 +11,7 @@ of state-space methods to navigation problems", Adv Control Syst 3 (1966) 293-34
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -42,6 +43,10 @@ _ODD_SHARE = 0.5
 # Share of the difference by which a frame changes what is usual.
 _FOLLOWED = 0.1
 
+LOST_AFTER = 10
+"""So many frames in a row that show a body and disagree are no chance: they show something else, or
+tracker or patient have moved farther than a frame's optimum reaches."""
+
 
 @dataclass(frozen=True, slots=True)
 class LiveState:
@@ -56,6 +61,18 @@ class LiveState:
 
     usual: float
     """Running mean of the share of grey values that the model explains."""
+
+    astray: int = 0
+    """How many frames in a row, up to now, show a body and do not agree."""
+
+    picture: int = 0
+    """Checksum of the last frame's grey values: shown again they tell nothing."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose, and its covariance, are to be trusted no longer (`LOST_AFTER`): the
+        next frame that agrees says that they are, or a new registration."""
+        return self.astray >= LOST_AFTER
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +99,23 @@ class Eye:
     lattice: Lattice
     reader: Reader | None
     """Finds the blood that is compared; None: grey values are."""
+
+    shape: tuple[int, int]
+    """Rows and columns of the sweep's pictures."""
+
+    def require(self, image: Float32, tracker_from_image: Float) -> None:
+        """Raise an InputError for a picture of another size, or for what is no transform."""
+        if np.shape(image) != self.shape:
+            raise InputError(
+                f"a frame must be of its sweep's size, {self.shape[0]} rows and {self.shape[1]} "
+                f"columns of grey values; got {np.shape(image)}: give the eye of its own sweep"
+            )
+        last = np.shape(tracker_from_image) == (4, 4) and tracker_from_image[3]
+        if last is False or (np.isfinite(last).all() and not np.array_equal(last, [0, 0, 0, 1])):
+            raise InputError(
+                "tracker_from_image must be a 4x4 transform with 0 0 0 1 for its last row; got "
+                f"{np.array2string(np.asarray(tracker_from_image), threshold=16)}"
+            )
 
     def sample(self, image: Float32, tracker_from_image: Float, phase: float) -> Samples:
         """Samples of one picture ``(h, w)``; none where it shows no body or has no pose."""
@@ -139,21 +173,28 @@ class Follower:
         Raises
         ------
         InputError
-            When the phase is not in [0, 1).
+            When the phase is not in [0, 1), the picture not of the eye's size, or the transform
+            none.
         """
         if not 0 <= phase < 1:
             raise InputError(f"a frame's phase must lie in [0, 1), got {phase!r}")
+        eye.require(image, tracker_from_image)
         waited = state.covariance_mm2 - self.shared_mm2 + self.creep_mm**2 * np.eye(6)
+        picture = zlib.crc32(np.ascontiguousarray(image).tobytes())
+        if picture == state.picture:
+            return self._left(state, waited)
+        state = replace(state, picture=picture)
         samples = eye.sample(image, tracker_from_image, phase)
         if samples.frames == 0:
             return self._left(state, waited)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
         if not explained > _ODD_SHARE * state.usual:
-            return self._left(state, waited)
+            return self._left(replace(state, astray=state.astray + 1), waited)
         usual = state.usual + _FOLLOWED * (explained - state.usual)
         step, covariance = self._update(samples, state.mr_from_tracker, waited)
         pose = self.pivot.move(state.mr_from_tracker, step)
-        return self._drift(LiveState(pose, covariance + self.shared_mm2, usual), used=True)
+        found = LiveState(pose, covariance + self.shared_mm2, usual, picture=picture)
+        return self._drift(found, used=True)
 
     def _left(self, state: LiveState, waited: Float) -> Drift:
         """After a frame that told nothing."""
@@ -227,6 +268,7 @@ def prepare_follower(
         Eye(
             lattice_of(seen, *lengths_mm),
             Reader.of(sweep, hurried=True) if settings.reading == "network" else None,
+            sweep.images.shape[1:],
         )
         for seen, sweep in zip(compared, sweeps, strict=True)
     ]
