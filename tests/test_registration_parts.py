@@ -7,16 +7,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from ellipsoid_heart import CENTRE_MM, moving_surfaces, record
+from ellipsoid_heart import CENTRE_MM, moving_surfaces, record, target_error_mm
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeline.registration.parts import gain_apart, parts_of
+from pipeline.registration.parts import parts_apart, parts_of
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.similarity import Expansion
+from pipeline.registration.space import find
+from pipeline.registration.verdict import APART
 
 PIVOT = Pivot(np.zeros(3), 40.0)
 BENDING = np.diag([2.0, 3.0, 1.0, 1.5, 0.5, 4.0]) + 0.2
@@ -48,7 +50,7 @@ def test_the_gain_of_parabolas_is_how_deep_their_own_optima_lie():
     level = Bowls(optima, depth=3.0)
     expected = 0.5 * BENDING[0, 0] / (3.0 - 0.5 * BENDING[0, 0])
     # What holds a part where its frames do not takes a hundredth of the mean curvature's gain.
-    assert gain_apart(level, np.zeros(6), PIVOT, sweep) == pytest.approx(expected, rel=0.02)
+    assert parts_apart(level, np.zeros(6), PIVOT, sweep).gain == pytest.approx(expected, rel=0.02)
 
 
 def test_scatter_between_frames_is_no_gain():
@@ -58,17 +60,45 @@ def test_scatter_between_frames_is_no_gain():
     gains = []
     for _ in range(400):
         level = Bowls(0.3 * rng.normal(size=(48, 6)), depth=3.0)
-        gains.append(gain_apart(level, np.zeros(6), PIVOT, sweep))
+        gains.append(parts_apart(level, np.zeros(6), PIVOT, sweep).gain)
     assert abs(np.mean(gains)) < 3 * np.std(gains) / np.sqrt(len(gains))
     assert np.std(gains) > 0
+
+
+def test_spread_of_parts_is_how_far_their_poses_lie_from_the_common_one():
+    """Two parts a step either way of the common pose, which holds them a little."""
+    step = np.array([2.0, 0, 0, 0, -1.0, 0])
+    level = Bowls(np.repeat([step, -step], 20, axis=0), depth=9.0)
+    found = parts_apart(level, np.zeros(6), PIVOT, np.repeat([0, 1], 20)).spread_mm2
+    held = np.linalg.solve(BENDING + 0.1 * np.trace(BENDING) / 6 * np.eye(6), BENDING) @ step
+    np.testing.assert_allclose(found, np.outer(held, held), atol=1e-9)
+    # Held a little everywhere, a part goes most of its way.
+    assert 0.6 < np.linalg.norm(held) / np.linalg.norm(step) < 1
+
+
+def test_frames_that_differ_by_chance_alone_show_little_spread():
+    rng = np.random.default_rng(8)
+    sweep = np.repeat([0, 1], 24)
+    found = [
+        np.trace(
+            parts_apart(
+                Bowls(0.3 * rng.normal(size=(48, 6)), depth=3.0), np.zeros(6), PIVOT, sweep
+            ).spread_mm2
+        )
+        for _ in range(100)
+    ]
+    # The mean of a part's twelve frames varies by 0.3**2 / 12 mm2 in each of six parameters: with
+    # that taken off less is left, and never less than nothing.
+    assert min(found) >= 0
+    assert np.mean(found) < 6 * 0.3**2 / 12
 
 
 def test_nothing_to_compare_gains_nothing():
     level = Bowls(np.eye(6)[np.zeros(11, int)])
     # Eleven frames of one sweep are no two parts of six.
-    assert gain_apart(level, np.zeros(6), PIVOT, np.zeros(11, int)) == 0
+    assert parts_apart(level, np.zeros(6), PIVOT, np.zeros(11, int)).gain == 0
     hopeless = Bowls(np.repeat([[9.0], [-9.0]], 20, axis=0) * np.ones(6))
-    assert gain_apart(hopeless, np.zeros(6), PIVOT, np.repeat([0, 1], 20)) == 0
+    assert parts_apart(hopeless, np.zeros(6), PIVOT, np.repeat([0, 1], 20)).gain == 0
 
 
 @given(sizes=st.lists(st.integers(0, 60), max_size=7))
@@ -109,7 +139,7 @@ def gain_of(recording, motion):
     level = search.fine_level(sweeps)
     pose = climb(level, recording.mr_from_tracker, search.pivot)
     sweep = level.samples.sweep([len(one.images) for one in sweeps])
-    return gain_apart(level, pose, search.pivot, sweep)
+    return parts_apart(level, pose, search.pivot, sweep).gain
 
 
 def shifted(x_mm):
@@ -137,3 +167,31 @@ def test_a_patient_who_moves_is_told_from_one_who_lies_still():
     ):
         assert gain_of(recording, motion) > max(0.06, 1.5 * still)
     assert still < 0.06
+
+
+def test_a_patient_who_moved_is_expected_as_an_error():
+    """By 6 mm between the sweeps: the common pose is off before the move or after it, or both.
+
+    It is held as well as any: its frames alone, and the surfaces' own error, expect what they do
+    of a patient who lies still.
+    """
+    recording, surfaces = record(seed=0, frames=30), moving_surfaces()
+    settings = RegisterSettings(
+        reading="grey", candidates=1, starts=1, grid_mm=3.0, sample_spacing_mm=6.0
+    )
+    before = recording.mr_from_tracker
+    still, apart = (
+        find(moved(recording, motion), recording.phases, surfaces, before, settings)
+        for motion in (lambda _: np.eye(4), lambda share: shifted(6 * (share > 0.5)))
+    )
+    points_mm = surfaces["lv_endocardium"].vertices_mm[0]
+    after = before @ np.linalg.inv(shifted(6))
+    off_mm = [
+        target_error_mm(apart.mr_from_tracker, truth, points_mm).mean() for truth in (before, after)
+    ]
+    assert min(off_mm) > 2
+    assert still.apart < APART < apart.apart
+    assert min(off_mm) < apart.expected_mm < max(off_mm)
+    assert apart.expected_mm > 1.5 * still.expected_mm
+    assert apart.chance_under_2_mm < 0.5 < still.chance_under_2_mm
+    assert "better with poses of their own" in apart.reason

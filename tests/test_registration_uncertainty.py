@@ -16,6 +16,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import transform_points
 from pipeline.registration import space
 from pipeline.registration.frames import Samples
+from pipeline.registration.parts import Apart
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import AS_IT_IS, Size
@@ -219,6 +220,7 @@ class TestVerdict:
             ({"expected_mm": 9.0}, "leave the pose open"),
             ({"expected_mm": float("nan")}, "leave the pose open"),
             ({"expected_mm": 9.0, "size": Size(0.08, 0.1)}, "better with a heart 8% larger"),
+            ({"expected_mm": 9.0, "apart": 0.4}, "is the calibration or the pixel size off"),
             ({"confidence": 1.1}, "no pose to trust"),
             (
                 {"confidence": 0.5, "misplaced": "mirrored"},
@@ -257,7 +259,8 @@ class TestVerdict:
         none = np.zeros(0, np.float32)
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
-        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": 0.0, "misplaced": ""}
+        same = Apart(0.0, np.zeros((6, 6)))
+        sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": same, "misplaced": ""}
         in_view = np.ones(40)
         level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
         found = SimpleNamespace(

@@ -6,31 +6,47 @@ between them, and is worth little however well it is held. So every part is aske
 its frames would agree with the model if only they had to: as much as the parabola that its slope
 and curvature make at the common pose falls to its bottom (as in the score test of C. R. Rao, Proc
 Camb Phil Soc 44 (1948) 50-57). Directions in which a part is not held gain nothing, and what the
-scatter between its own frames lets expect is no gain.
+scatter between its own frames lets expect is no gain. How far the bottoms lie from the common pose
+tells how far that may be off.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.geometry import Float, Integer
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.search import Level
+from pipeline.registration.similarity import Expansion
+from pipeline.registration.uncertainty import rising
 
 # So many parts where there are frames enough: each of one sweep, and of no fewer frames than have
 # six parameters to fit.
 _PARTS, _LEAST_FRAMES = 4, 6
-# Of the mean curvature: what holds a part where its frames do not.
-_DAMPING = 0.01
+# Of the mean curvature: what holds a part where its frames do not. Where it would go without is of
+# no account for what it gains, but for how far off the common pose is said to be.
+_DAMPING, _FIRM_DAMPING = 0.01, 0.1
 
 
-def gain_apart(level: Level, pose: Float, pivot: Pivot, sweep: Integer) -> float:
-    """By what share of the score frames would agree better if each part had a pose of its own.
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How parts of a recording differ."""
 
-    0 where there are fewer than two parts, or no agreement; below 0 where parts differ less than
-    their frames do.
+    gain: float
+    """By what share of the score frames would agree better if each part had a pose of its own. 0
+    where there are fewer than two parts, or no agreement; below 0 where parts differ less than
+    their frames do."""
+
+    spread_mm2: Float
+    """``(6, 6)`` of the parts' own poses about the common one, square millimetres of `Pivot.move`,
+    less what the scatter between frames lets expect."""
+
+
+def parts_apart(level: Level, pose: Float, pivot: Pivot, sweep: Integer) -> Apart:
+    """How the parts of a recording differ.
 
     Parameters
     ----------
@@ -44,8 +60,10 @@ def gain_apart(level: Level, pose: Float, pivot: Pivot, sweep: Integer) -> float
     agreed = -float(level.losses(pose).sum())
     parts = list(parts_of(sweep))
     if len(parts) < 2 or not agreed > 0:
-        return 0.0
-    return sum(_gain(level.only(part), pose, pivot) for part in parts) / agreed
+        return Apart(0.0, np.zeros((6, 6)))
+    each = [level.only(part).expansion(pose, pivot) for part in parts]
+    spread_mm2 = np.mean([_step_squared(one) for one in each], axis=0)
+    return Apart(sum(_gain(one) for one in each) / agreed, rising(spread_mm2))
 
 
 def parts_of(sweep: Integer) -> Iterator[Integer]:
@@ -58,14 +76,30 @@ def parts_of(sweep: Integer) -> Iterator[Integer]:
         yield from np.array_split(own, pieces) if pieces else ()
 
 
-def _gain(level: Level, pose: Float, pivot: Pivot) -> float:
+def _gain(here: Expansion) -> float:
     """How far the summed loss would fall from here, by its slope and curvature, less what it would
-    by chance if the frames' slopes were independent draws with this scatter."""
-    here = level.expansion(pose, pivot)
-    damping = _DAMPING * np.trace(here.bending) / 6
-    if not damping > 0:
-        return 0.0
+    by chance."""
+    held = _held(here, _DAMPING)
+    return 0.0 if held is None else float(np.trace(np.linalg.solve(held, _drawn(here))) / 2)
+
+
+def _step_squared(here: Expansion) -> Float:
+    """``(6, 6)`` outer product of the step to the bottom, less what it would be by chance."""
+    held = _held(here, _FIRM_DAMPING)
+    if held is None:
+        return np.zeros((6, 6))
+    inverse = np.linalg.inv(held)
+    return np.asarray(inverse @ _drawn(here) @ inverse)
+
+
+def _held(here: Expansion, damping: float) -> Float | None:
+    """Curvature of the summed loss, held a little everywhere; None where it does not bend up."""
+    least = damping * np.trace(here.bending) / 6
+    return np.asarray(here.bending + least * np.eye(6)) if least > 0 else None
+
+
+def _drawn(here: Expansion) -> Float:
+    """``(6, 6)`` square of the summed slope, less what it would be if the frames' slopes were
+    independent draws with their scatter."""
     slope = here.slopes.sum(axis=0)
-    scatter = len(here.slopes) * np.cov(here.slopes.T)
-    reached = np.linalg.solve(here.bending + damping * np.eye(6), np.outer(slope, slope) - scatter)
-    return float(np.trace(reached) / 2)
+    return np.asarray(np.outer(slope, slope) - len(here.slopes) * np.cov(here.slopes.T))

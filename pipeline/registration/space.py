@@ -31,7 +31,7 @@ from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
 from pipeline.registration.misplaced import by_chance
 from pipeline.registration.open_ends import open_ends, open_lids
-from pipeline.registration.parts import gain_apart
+from pipeline.registration.parts import Apart, parts_apart
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.reading import as_compared
 from pipeline.registration.search import Level, Search, prepare_search
@@ -47,6 +47,7 @@ from pipeline.registration.uncertainty import (
     sandwich,
 )
 from pipeline.registration.verdict import (
+    APART,
     Evidence,
     Grade,
     Verdict,
@@ -149,7 +150,7 @@ class _Found:
     """Of the frames of ``everything``, as those of ``breath_mm``."""
 
     size: Size
-    apart: float
+    apart: Apart
     clocks: ClocksApart | None
     misplaced: str
     """See `Evidence`."""
@@ -353,6 +354,8 @@ def _covariance(
     spread = in_radians(sandwich(curvature, judged.samples.sweep(sizes)), search.pivot)
     floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
     floor += in_radians(found.size.error_mm**2 * np.eye(6), search.pivot)
+    if found.apart.gain > APART:
+        floor += in_radians(found.apart.spread_mm2, search.pivot)
     if found.calibration is None:
         return np.asarray(spread + floor), ()
     opened, corrections = certainty(found.calibration, judged, found.pose, search.settings)
@@ -392,15 +395,15 @@ def _summarise(
         verdict=verdict.grade,
         reason=verdict.reason,
         size=found.size,
-        apart=found.apart,
+        apart=found.apart.gain,
         clock=found.clock,
     )
 
 
-def _apart(level: Level, pose: Float, pivot: Pivot, sizes: Sequence[int]) -> float:
-    """What parts of the recording, of frames that show the heart, gain by poses of their own."""
+def _apart(level: Level, pose: Float, pivot: Pivot, sizes: Sequence[int]) -> Apart:
+    """How parts of the recording, of frames that show the heart, differ."""
     shows = level.only(np.flatnonzero(level.at(pose).in_view > LEAST_IN_VIEW))
-    return gain_apart(shows, pose, pivot, shows.samples.sweep(sizes))
+    return parts_apart(shows, pose, pivot, shows.samples.sweep(sizes))
 
 
 def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
@@ -421,7 +424,7 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
-        apart=found.apart,
+        apart=found.apart.gain,
         clocks=found.clocks,
         misplaced=found.misplaced,
     )

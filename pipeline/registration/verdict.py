@@ -131,13 +131,15 @@ def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
     is good where its expected error is small, most frames bear it out and none of that is near.
     """
     failures, of_size = _failures(evidence, settings), _doubts_of_size(evidence.size)
+    of_parts = _doubts_of_parts(evidence.apart)
     if failures and evidence.confidence < 1:
         # Where frames fit better in the wrong place, a size that fits better there says nothing.
         return Verdict("failed", "; ".join(failures))
     if failures:
-        # A wrong size widens the expected error: where that fails, it is the cause.
-        return Verdict("failed", "; ".join([*of_size, *failures]))
-    doubts = [*_doubts(evidence, settings), *of_size]
+        # A wrong size, and parts that differ, widen the expected error: where that fails, they are
+        # the cause.
+        return Verdict("failed", "; ".join([*of_size, *of_parts, *failures]))
+    doubts = [*_doubts(evidence, settings), *of_parts, *of_size]
     return Verdict("doubtful" if doubts else "good", "; ".join(doubts))
 
 
@@ -215,12 +217,6 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
             "the others do: was the patient, the tracker or the reference moved meanwhile, or the "
             "depth changed? Cut them off, or record the sweep again"
         )
-    if evidence.apart > APART:
-        reasons.append(
-            f"parts of the recording agree {evidence.apart:.0%} better with poses of their own: "
-            "was the patient, the tracker or the reference moved meanwhile, or is the calibration "
-            "or the pixel size off?"
-        )
     if evidence.clocks is not None:
         ahead, behind, by_s = evidence.clocks.ahead, evidence.clocks.behind, evidence.clocks.by_s
         reasons.append(
@@ -230,6 +226,16 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
     if evidence.valid < 0.5 * evidence.frames:
         reasons.append(f"{evidence.valid} of {evidence.frames} frames bear the pose out")
     return reasons
+
+
+def _doubts_of_parts(apart: float) -> list[str]:
+    if not apart > APART:
+        return []
+    return [
+        f"parts of the recording agree {apart:.0%} better with poses of their own: was the "
+        "patient, the tracker or the reference moved meanwhile, is the calibration or the pixel "
+        "size off, or do images lag behind the tracker's poses?"
+    ]
 
 
 def _doubts_of_size(size: Size) -> list[str]:
