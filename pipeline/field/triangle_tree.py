@@ -311,7 +311,8 @@ def _choose_axes(boxes, group, count, axes, normal):  # type: ignore[no-untyped-
     """Axes of a box around eight: their mean normal, and the way from their middle to the
     furthest of them."""
     middle, third = np.zeros(3), axes[2]
-    third[:] = 0.0
+    for k in range(3):
+        third[k] = 0.0
     for lane in range(count):
         _normal(boxes, group, lane, normal)
         area = boxes[group, 9, lane] * boxes[group, 10, lane]
@@ -320,7 +321,8 @@ def _choose_axes(boxes, group, count, axes, normal):  # type: ignore[no-untyped-
             middle[k] += boxes[group, k, lane] / count
     if not _unit(third):
         # Normals that cancel leave every axis as good as another.
-        third[:] = normal
+        for k in range(3):
+            third[k] = normal[k]
         _unit(third)
     furthest = -1.0
     for lane in range(count):
@@ -333,10 +335,13 @@ def _choose_axes(boxes, group, count, axes, normal):  # type: ignore[no-untyped-
             length2 += normal[k] ** 2
         if length2 > furthest:
             furthest = length2
-            axes[0, :] = normal
+            for k in range(3):
+                axes[0, k] = normal[k]
     if not _unit(axes[0]):
         least = 0 if abs(third[0]) < 0.6 else 1
-        axes[0, :] = -third[least] * third
+        part = -third[least]
+        for k in range(3):
+            axes[0, k] = part * third[k]
         axes[0, least] += 1.0
         _unit(axes[0])
     axes[1, 0] = third[1] * axes[0, 2] - third[2] * axes[0, 1]

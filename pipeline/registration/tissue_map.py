@@ -317,11 +317,12 @@ def _mark_crossings(vertices, triangles, changes):  # type: ignore[no-untyped-de
     """Add all triangles' steps to the running sums along axis 0 of ``changes``."""
     for t in range(len(triangles)):
         a, b, c = triangles[t]
-        corners = vertices[triangles[t]]
+        ya, yb, yc = vertices[a, 1], vertices[b, 1], vertices[c, 1]
+        za, zb, zc = vertices[a, 2], vertices[b, 2], vertices[c, 2]
         bounds = (
-            max(0, math.ceil(corners[:, 1].min())),
-            min(changes.shape[1] - 1, math.floor(corners[:, 1].max())),
-            max(0, math.ceil(corners[:, 2].min())),
-            min(changes.shape[2] - 1, math.floor(corners[:, 2].max())),
+            max(0, math.ceil(min(ya, yb, yc))),
+            min(changes.shape[1] - 1, math.floor(max(ya, yb, yc))),
+            max(0, math.ceil(min(za, zb, zc))),
+            min(changes.shape[2] - 1, math.floor(max(za, zb, zc))),
         )
         _mark_triangle(vertices, a, b, c, bounds, changes)

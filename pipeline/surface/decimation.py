@@ -181,7 +181,8 @@ def _take_out(path, triangles, alive, host, ring, degree, guests, n, bound):  # 
             cost = _cost(path, triangles, star, n, u, passed, least, hosts)
             if cost < least:
                 best, least = u, cost
-                best_hosts[:] = hosts
+                for one in range(len(hosts)):
+                    best_hosts[one] = hosts[one]
     if best < 0:
         return False
     for t in star:
@@ -192,7 +193,8 @@ def _take_out(path, triangles, alive, host, ring, degree, guests, n, bound):  # 
             for corner in range(3):
                 if corners[corner] == n:
                     triangles[t, corner] = best
-    host[passed] = best_hosts
+    for one in range(len(passed)):
+        host[passed[one]] = best_hosts[one]
     return True
 
 

@@ -135,7 +135,8 @@ def faulty(vertices, triangles, least_quality):  # type: ignore[no-untyped-def]
     around, _ = corner_normals(vertices, triangles)
     for n in range(len(around)):
         length = math.sqrt(around[n, 0] ** 2 + around[n, 1] ** 2 + around[n, 2] ** 2)
-        around[n] /= max(length, 1e-300)
+        for axis in range(3):
+            around[n, axis] /= max(length, 1e-300)
     fault = np.zeros(len(triangles), np.bool_)
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
