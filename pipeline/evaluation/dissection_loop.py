@@ -296,7 +296,8 @@ def _begin(task, waves, mind, plan, hand, tip, pose):  # type: ignore[no-untyped
     plan[0, 0], plan[0, 1], plan[0, 2] = hx, hy, hz
     mind[Mind.START], mind[Mind.LASTS] = -1.0, 1.0
     _wish(mind, plan, waves, 0.0, hand[2])
-    hand[0] = hand[2]
+    for k in range(3):
+        hand[0, k] = hand[2, k]
     tip[0], tip[1], tip[2] = _across(hand[0], task.pivot_mm, task.rod_mm)
     _frame_of(tip, task.pivot_mm, pose)
 
@@ -317,7 +318,8 @@ def _follow(task, guide, hand, tip, pose, phase, sums):  # type: ignore[no-untyp
     """Bring the tip to where the handle is; count path, force and what lies outside."""
     size = math.sqrt(hand[4, 0] ** 2 + hand[4, 1] ** 2 + hand[4, 2] ** 2)
     sums[Sum.FORCE] = max(sums[Sum.FORCE], size)
-    hand[2] = hand[3]
+    for k in range(3):
+        hand[2, k] = hand[3, k]
     x, y, z = _across(hand[0], task.pivot_mm, task.rod_mm)
     way = math.sqrt((x - tip[0]) ** 2 + (y - tip[1]) ** 2 + (z - tip[2]) ** 2)
     sums[Sum.PATH] += way
