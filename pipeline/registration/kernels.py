@@ -57,10 +57,8 @@ def add_up(  # type: ignore[no-untyped-def]
         count, stop = 0, min(start + _TILE, first[f + 1])
         _ask_for(share, before, after, points, start, stop, m, shift[f])
         for s in range(start, stop):
-            px, py, pz = points[s, 0], points[s, 1], points[s, 2]
-            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[f, 0]
-            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[f, 1]
-            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[f, 2]
+            x, y, z = _moved(points, s, m)
+            x, y, z = x + shift[f, 0], y + shift[f, 1], z + shift[f, 2]
             i, j, k = math.floor(x), math.floor(y), math.floor(z)
             if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
                 u, v, w = np.float32(x - i), np.float32(y - j), np.float32(z - k)
@@ -104,16 +102,24 @@ def _tiles(first, trend_row):  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def _moved(points, s, m):  # type: ignore[no-untyped-def]
+    """A sample's place by a 4x4 transform."""
+    px, py, pz = points[s, 0], points[s, 1], points[s, 2]
+    x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
+    y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
+    z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+    return x, y, z
+
+
+@_compiled
 def _ask_for(share, before, after, points, start, stop, m, shift):  # type: ignore[no-untyped-def]
     """Have what the model holds around samples brought, in two phases."""
     _, depth, height, width, parts = share.shape
     address, size = np.uintp(share.ctypes.data), parts * share.itemsize
     early, late = before * depth * height * width, after * depth * height * width
     for s in range(start, stop):
-        px, py, pz = points[s, 0], points[s, 1], points[s, 2]
-        x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] + shift[0]
-        y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] + shift[1]
-        z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] + shift[2]
+        x, y, z = _moved(points, s, m)
+        x, y, z = x + shift[0], y + shift[1], z + shift[2]
         if 0 <= x < width - 1 and 0 <= y < height - 1 and 0 <= z < depth - 1:
             for k in range(int(z), int(z) + 2):
                 for j in range(int(y), int(y) + 2):
@@ -201,10 +207,7 @@ def bend(  # type: ignore[no-untyped-def]
         count, stop = 0, min(start + _TILE, first[f + 1])
         _ask_for(share, before, after, points, start, stop, m, shift[f])
         for s in range(start, stop):
-            px, py, pz = points[s, 0], points[s, 1], points[s, 2]
-            x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
-            y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
-            z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
+            x, y, z = _moved(points, s, m)
             at = x + shift[f, 0], y + shift[f, 1], z + shift[f, 2]
             i, j, k = math.floor(at[0]), math.floor(at[1]), math.floor(at[2])
             if 0 <= i < width - 1 and 0 <= j < height - 1 and 0 <= k < depth - 1:
