@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from pipeline.geometry import Float, Grid, MovingSurface, Surface, transform_points
 from pipeline.registration import similarity
-from pipeline.registration.frames import sample_frames
+from pipeline.registration.frames import choose, sample_frames
 from pipeline.registration.pose_search import climb, pivot_of
 from pipeline.registration.search import Level
 from pipeline.registration.similarity import agreement
@@ -190,6 +190,30 @@ class TestAgreement:
             held_back = explained * 1e-3 / (weakest + 1e-3)
             rounding = 1e-4
             assert explained - held_back - rounding < found[frame] < explained + rounding
+
+    def test_each_frame_is_compared_on_its_own_however_many_samples_others_have(
+        self, tissue_map, recording
+    ):
+        """Two sweeps, and of every third frame the first samples alone."""
+        whole = sample_frames(recording.sweeps, recording.phases, 4.0, 1.5, 20.0)
+        counts = np.diff(whole.first)
+        counts[::3] = 100
+        kept = np.concatenate(
+            [start + np.arange(count) for start, count in zip(whole.first, counts, strict=False)]
+        )
+        samples = replace(
+            whole,
+            points_mm=whole.points_mm[kept],
+            grey=whole.grey[kept],
+            first=np.concatenate([[0], np.cumsum(counts)]),
+        )
+        pose = recording.mr_from_tracker
+        together = agreement(samples, tissue_map, pose)
+        for frame in range(samples.frames):
+            alone = agreement(choose(samples, np.array([frame])), tissue_map, pose)
+            np.testing.assert_allclose(together.explained[frame], alone.explained[0], rtol=1e-9)
+            np.testing.assert_allclose(together.in_view[frame], alone.in_view[0], rtol=1e-9)
+        assert (together.explained[counts > 100] > 0).all()
 
     def test_agreement_is_best_at_the_true_pose(self, tissue_map, recording):
         samples = sample_frames(recording.sweeps, recording.phases, 4.0, 1.5, 20.0)

@@ -71,8 +71,8 @@ def add_up(  # type: ignore[no-untyped-def]
                     carried = _carried(share, before, after, late, k, j, i, (u, v, w))[0]
                     shares[2, count] = carried
                 shares[0, count], shares[1, count] = blood, wall
-                beside[count, 0], beside[count, 1] = grey[s], blood
-                beside[count, 2], beside[count, 3], beside[count, 4] = wall, carried, 1
+                _lay(beside, count, grey[s], blood, wall, carried)
+                beside[count, SUMS - 1] = 1
                 rows[count] = trend_row[f] + s - first[f]
                 if blood > 0 or wall > 0 or carried > 0:
                     count += 1
@@ -83,6 +83,12 @@ def add_up(  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def _lay(beside, n, grey, blood, wall, carried):  # type: ignore[no-untyped-def]
+    """What each value of a tile's sample ``n`` is multiplied with: grey, and the parts."""
+    beside[n, 0], beside[n, 1], beside[n, 2], beside[n, 3] = grey, blood, wall, carried
+
+
+@_compiled
 def _tiles(first, trend_row):  # type: ignore[no-untyped-def]
     """Frame and first sample of every tile; of frames with one trend, all first tiles first."""
     frames, most, count, begin = len(trend_row), 0, 0, 0
@@ -90,13 +96,15 @@ def _tiles(first, trend_row):  # type: ignore[no-untyped-def]
         most += (first[f + 1] - first[f] + _TILE - 1) // _TILE
     tiles = np.empty((most, 2), np.int64)
     while begin < frames:
-        end = begin + 1
+        end, longest = begin, 0
         while end < frames and trend_row[end] == trend_row[begin]:
+            longest = max(longest, first[end + 1] - first[end])
             end += 1
-        for passed in range(0, first[begin + 1] - first[begin], _TILE):
+        for passed in range(0, longest, _TILE):
             for f in range(begin, end):
-                tiles[count, 0], tiles[count, 1] = f, first[f] + passed
-                count += 1
+                if first[f] + passed < first[f + 1]:
+                    tiles[count, 0], tiles[count, 1] = f, first[f] + passed
+                    count += 1
         begin = end
     return tiles
 
@@ -229,13 +237,8 @@ def bend(  # type: ignore[no-untyped-def]
                 ax = (x - centre[0]) * spacing_mm[0] * turn
                 ay = (y - centre[1]) * spacing_mm[1] * turn
                 az = (z - centre[2]) * spacing_mm[2] * turn
-                changes[0, count], changes[1, count] = slope_x, slope_y
-                changes[2, count] = slope_z
-                changes[3, count] = ay * slope_z - az * slope_y
-                changes[4, count] = az * slope_x - ax * slope_z
-                changes[5, count] = ax * slope_y - ay * slope_x
-                beside[count, 0], beside[count, 1] = grey[s], blood
-                beside[count, 2], beside[count, 3] = wall, carried
+                _change(changes, count, slope_x, slope_y, slope_z, ax, ay, az)
+                _lay(beside, count, grey[s], blood, wall, carried)
                 for change in range(6):
                     beside[count, 1 + PARTS + change] = changes[change, count]
                 rows[count] = trend_row[f] + s - first[f]
@@ -245,6 +248,13 @@ def bend(  # type: ignore[no-untyped-def]
             _fill_up(changes, rows, count)
             _multiply(pushes[f], changes, count, beside, every)
             _multiply(with_trend[f], changes, count, trend, rows)
+
+
+@_compiled
+def _change(changes, n, x, y, z, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Changes by a shift along each axis, and by a turn about each: the arm times the slope."""
+    changes[0, n], changes[1, n], changes[2, n] = x, y, z
+    changes[3, n], changes[4, n], changes[5, n] = ay * z - az * y, az * x - ax * z, ax * y - ay * x
 
 
 @_compiled
