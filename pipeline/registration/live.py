@@ -110,11 +110,14 @@ class Eye:
                 f"a frame must be of its sweep's size, {self.shape[0]} rows and {self.shape[1]} "
                 f"columns of grey values; got {np.shape(image)}: give the eye of its own sweep"
             )
-        last = np.shape(tracker_from_image) == (4, 4) and tracker_from_image[3]
-        if last is False or (np.isfinite(last).all() and not np.array_equal(last, [0, 0, 0, 1])):
+        transform = np.asarray(tracker_from_image)
+        # One that was lost, all NaN, is no frame's place, but is what trackers tell.
+        if transform.shape != (4, 4) or (
+            np.isfinite(transform[3]).all() and not np.allclose(transform[3], [0, 0, 0, 1])
+        ):
             raise InputError(
                 "tracker_from_image must be a 4x4 transform with 0 0 0 1 for its last row; got "
-                f"{np.array2string(np.asarray(tracker_from_image), threshold=16)}"
+                f"{np.array2string(transform, threshold=16)}"
             )
 
     def sample(self, image: Float32, tracker_from_image: Float, phase: float) -> Samples:

@@ -259,19 +259,14 @@ def _softened(values: Float32, sigma: Sequence[float], truncate: float = 4.0) ->
 
     ``sigma``: standard deviations in nodes along z, y and x; cut off at ``truncate`` of them.
     """
-    z, y, x = (_gaussian(each, int(truncate * each + 0.5)) for each in sigma)
+    reaches = (int(truncate * each + 0.5) for each in sigma)
+    z, y, x = map(cv2.getGaussianKernel, (2 * reach + 1 for reach in reaches), sigma)
     planes = np.stack(
         [cv2.sepFilter2D(plane, -1, x, y, borderType=cv2.BORDER_CONSTANT) for plane in values]
     )
     along = planes.reshape(len(planes), -1)
     soft = cv2.sepFilter2D(along, -1, np.ones(1), z, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(soft.reshape(values.shape), np.float32)
-
-
-def _gaussian(sigma: float, reach: int) -> Float:
-    """``(2 reach + 1,)`` weights that sum to 1."""
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.asarray(weights / weights.sum())
 
 
 def _grid_around(
