@@ -77,7 +77,9 @@ def orders(arguments: argparse.Namespace) -> Iterator[Order]:
         names = [one.name.split("-", 1) for one in Path(arguments.surfaces).iterdir()]
         hearts = sorted((int(seed), illness) for seed, illness in names)[: arguments.hearts]
         if not hearts:
-            raise SystemExit(f"{arguments.surfaces}: no products of benchmarks/segmentation_figures.py")
+            raise SystemExit(
+                f"{arguments.surfaces}: no products of benchmarks/segmentation_figures.py"
+            )
     frames = [int(count) for count in arguments.frames.split(",")]
     examined = ((heart, probe) for heart in hearts for probe in arguments.probes.split(","))
     for k, ((seed, illness), probe) in enumerate(examined):
