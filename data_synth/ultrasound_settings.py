@@ -27,14 +27,20 @@ class UltrasoundSettings(BaseModel):
     sweeps: int = Field(default=2, ge=1, le=3)
     """How many of the three windows are used, in that order."""
     frames: int = Field(default=40, ge=1, le=2000)
+    """Of each sweep."""
     frame_rate_hz: float = Field(default=20.0, gt=0, le=200)
     depth_mm: float | None = Field(default=None, ge=40, le=250)
+    """Range at which the picture ends."""
     angle_deg: float | None = Field(default=None, ge=20, le=120)
+    """Of the fan, from its first beam to its last."""
     pixel_mm: float | None = Field(default=None, ge=0.1, le=3)
+    """Of the picture, square."""
     beams: int | None = Field(default=None, ge=16, le=512)
+    """Of each picture, evenly over the fan."""
     frequency_mhz: float | None = Field(default=None, ge=1, le=15)
     gain_db: float = Field(default=0.0, ge=-30, le=30)
     dynamic_range_db: float = Field(default=58.0, ge=30, le=90)
+    """From black to white in the picture."""
     compensation_db_per_cm: float | None = Field(default=None, ge=0, le=12)
     """Time-gain compensation."""
     slice_mm: float | None = Field(default=None, ge=0, le=5)
