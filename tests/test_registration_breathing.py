@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from ellipsoid_heart import moving_surfaces, record, target_error_mm
 
-from pipeline.registration.breathing import AXIS, likeliest_way_mm
+from pipeline.registration.breathing import (
+    AXIS,
+    is_mostly_inspired,
+    likeliest_way_mm,
+    rest_error_mm,
+)
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
 
@@ -36,6 +41,23 @@ def test_the_likeliest_way_is_that_of_all_ways_that_costs_least():
 
 def test_frames_that_say_nothing_stay_at_rest():
     np.testing.assert_array_equal(likeliest_way_mm(np.zeros((5, 97))), 0.0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_rest_is_as_unsure_as_breaths_differ(n):
+    """What a quarter of the frames lie before is off by no more than 1.5 deviations of what is
+    told, whether breaths are even or rest for long (Lujan's form)."""
+    breath_mm = 10 * np.cos(np.linspace(0, np.pi, 1000, endpoint=False)) ** (2 * n)
+    assert np.quantile(breath_mm, 0.25) < 1.6 * rest_error_mm(breath_mm)
+    assert not is_mostly_inspired(breath_mm)
+    # Who rests with full lungs is told, unless the breath is shallow.
+    assert is_mostly_inspired(10 - breath_mm) == (n > 1)
+    assert not is_mostly_inspired((10 - breath_mm) / 6)
+
+
+def test_breath_that_was_held_leaves_rest_sure():
+    assert rest_error_mm(np.zeros(40)) == 0
+    assert not is_mostly_inspired(np.zeros(40))
 
 
 @pytest.fixture(scope="module")

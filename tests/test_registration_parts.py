@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from pipeline.registration.dissent import NONE, dissent
 from pipeline.registration.parts import parts_apart, parts_of
 from pipeline.registration.pose_search import Pivot, climb
 from pipeline.registration.search import prepare_search
@@ -195,3 +196,40 @@ def test_a_patient_who_moved_is_expected_as_an_error():
     assert apart.expected_mm > 1.5 * still.expected_mm
     assert apart.chance_under_2_mm < 0.5 < still.chance_under_2_mm
     assert "better with poses of their own" in apart.reason
+
+
+@pytest.mark.parametrize("seen", ["heart", "noise"])
+def test_frames_that_contradict_with_one_voice_leave_the_pose_open(seen):
+    """The second sweep was taken after the patient moved by 12 mm, or shows nothing at all."""
+    recording = record(seed=0, frames=24)
+    sweeps = moved(recording, lambda share: shifted(12 * (share > 0.5)))
+    if seen == "noise":
+        noise = np.random.default_rng(1).normal(100, 30, sweeps[1].images.shape)
+        shown = np.where(sweeps[1].images > 0, np.clip(noise, 1, 255), 0).astype(np.float32)
+        sweeps[1] = replace(sweeps[1], images=shown)
+    settings = RegisterSettings(
+        reading="grey", grid_mm=3.0, sample_spacing_mm=6.0, candidates=100, starts=4
+    )
+    search = prepare_search(recording.phases, moving_surfaces(), None, settings)
+    level = search.fine_level(sweeps)
+    first = level.samples.sweep([24, 24]) == 0
+    pose = recording.mr_from_tracker
+    found = dissent(search, sweeps, level, pose, first, ~first)
+    if seen == "noise":
+        assert found is NONE
+        return
+    after = pose @ np.linalg.inv(shifted(12))
+    step = search.pivot.step_between(pose, after)
+    np.testing.assert_allclose(search.pivot.move(pose, step), after, atol=1e-9)
+    # As truly as one sweep tells a pose.
+    assert found.away_mm == pytest.approx(np.linalg.norm(step[:3]), abs=1.5)
+    most = np.linalg.eigh(found.spread_mm2)
+    assert most[0][-1] == pytest.approx(np.linalg.norm(step) ** 2 / 2, rel=0.3)
+    assert abs(most[1][:, -1] @ step) > 0.95 * np.linalg.norm(step)
+
+
+def test_a_few_frames_have_no_pose_of_their_own():
+    level = Bowls(np.eye(6)[np.zeros(20, int)])
+    few = np.arange(20) < 9
+    assert dissent(None, [], level, np.zeros(6), ~few, few) is NONE
+    assert dissent(None, [], level, np.zeros(6), np.zeros(20, bool), ~few) is NONE

@@ -15,6 +15,7 @@ from scipy.stats import chi
 from pipeline.errors import StageError
 from pipeline.geometry import transform_points
 from pipeline.registration import space
+from pipeline.registration.dissent import NONE, longest_astray, outvoted
 from pipeline.registration.frames import Samples
 from pipeline.registration.parts import Apart
 from pipeline.registration.pose_search import Pivot
@@ -30,7 +31,7 @@ from pipeline.registration.uncertainty import (
     motion_between,
     sandwich,
 )
-from pipeline.registration.verdict import Evidence, judge, longest_astray, outvoted
+from pipeline.registration.verdict import Evidence, judge
 
 PIVOT = Pivot(np.array([10.0, -20.0, 30.0]), 40.0)
 BENDING = np.diag([2.0, 3.0, 1.0, 1.5, 0.5, 4.0]) + 0.2
@@ -203,8 +204,11 @@ class TestVerdict:
             ({"expected_mm": 2.0}, "expected error 2.0 mm"),
             ({"confidence": 1.7}, "1.70 times"),
             ({"rival": 0.8}, "to 80%"),
-            ({"valid": 20}, "20 of 48"),
+            ({"valid": 35}, "35 of 48 frames that show the heart"),
+            ({"valid": 24}, "24 of 48 frames that show the heart"),
             ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
+            ({"outvoted": (2,), "elsewhere_mm": 5.2}, "and agree on a place 5 mm away"),
+            ({"inspired": True}, "the heart is taken to rest"),
             ({"size": Size(-0.08, 0.1)}, "agree 10% better with a heart 8% smaller than"),
             ({"apart": 0.07}, "parts of the recording agree 7% better with poses of their own"),
         ],
@@ -228,6 +232,8 @@ class TestVerdict:
             ),
             ({"rival": 0.95}, "two poses far apart"),
             ({"valid": 3}, "only 3 of 48"),
+            ({"valid": 23}, "only 23 of 48 frames that show the heart bear the registration out"),
+            ({"expected_mm": 9.0, "astray": (12, 1)}, "12 frames in a row of sweep 1"),
             ({"shift_mm": 31.0}, "31.0 mm"),
             ({"turn_deg": 31.0}, "31.0 degrees"),
         ],
@@ -260,11 +266,12 @@ class TestVerdict:
         begins = np.zeros(41, np.int64)
         samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
         same = Apart(0.0, np.zeros((6, 6)))
+        alone = {"dissent": NONE, "breath_mm": np.zeros(40)}
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": same, "misplaced": ""}
         in_view = np.ones(40)
         level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
         found = SimpleNamespace(
-            everything=level, bears_out=borne_out, pose=None, clocks=None, **sure
+            everything=level, bears_out=borne_out, pose=None, clocks=None, **sure, **alone
         )
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
         verdict = space._verdict(found, search, (20, 20), 1.0)
@@ -312,8 +319,17 @@ def test_a_turn_that_the_shift_undoes_at_a_point_leaves_it_in_its_place():
 
 
 def test_nine_frames_that_bear_it_out_are_one_too_few():
-    assert judge(Evidence(**(SOUND | {"valid": 9})), RegisterSettings()).grade == "failed"
-    assert judge(Evidence(**(SOUND | {"valid": 10})), RegisterSettings()).grade == "doubtful"
+    few = SOUND | {"frames": 10}
+    assert judge(Evidence(**(few | {"valid": 9})), RegisterSettings()).grade == "failed"
+    assert judge(Evidence(**(few | {"valid": 10})), RegisterSettings()).grade == "good"
+
+
+def test_frames_that_are_truly_misplaced_need_no_better_start():
+    wrong = SOUND | {"confidence": 0.1, "shift_mm": 31.0}
+    said = judge(Evidence(**wrong), RegisterSettings()).reason
+    assert "give a better start" in said
+    said = judge(Evidence(**wrong, misplaced="mirrored"), RegisterSettings()).reason
+    assert "give a better start" not in said
 
 
 def test_six_fitted_parameters_are_taken_off_the_frames():

@@ -12,7 +12,8 @@ import pytest
 from sweep_files import COLUMNS, FRAMES, PIXELS, ROWS, calibration, good_fields, rigid, text, write
 
 from pipeline.errors import InputError
-from pipeline.imaging.ultrasound import odd_transforms, read_sweep
+from pipeline.imaging.ultrasound import odd_transforms, read_sweep, read_sweeps
+from pipeline.study import UltrasoundFiles
 
 
 @pytest.mark.parametrize(
@@ -123,6 +124,23 @@ def test_sweep_without_a_valid_frame_is_refused(tmp_path):
         fields[f"Seq_Frame{k:04d}_ProbeToTrackerTransformStatus"] = "INVALID"
     with pytest.raises(InputError, match="none of its 5 frames"):
         read_sweep(write(tmp_path / "s.mha", fields))
+
+
+@pytest.mark.parametrize("shared", [2, 3])
+def test_a_sweep_that_is_another_once_more_is_refused(tmp_path, shared):
+    """A recording that was copied, or cut in two that overlap, is no second view."""
+    other = PIXELS.copy()
+    other[shared:] += 1
+    paths = [
+        write(tmp_path / "one.mha", good_fields(), PIXELS),
+        write(tmp_path / "two.mha", good_fields(), other),
+    ]
+    files = UltrasoundFiles(sweeps=tuple(paths))
+    if shared == 2:
+        assert len(read_sweeps(files)) == 2
+        return
+    with pytest.raises(InputError, match=r"two\.mha: 3 of its pictures are those of .*one\.mha"):
+        read_sweeps(files)
 
 
 def test_missing_file_is_named(tmp_path):

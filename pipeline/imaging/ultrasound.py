@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,12 +91,14 @@ def read_sweeps(files: UltrasoundFiles) -> list[Sweep]:
     Raises
     ------
     InputError
-        When one cannot be read (`read_sweep`), when their poses are in different frames, or when
-        the patient's reference moves and nothing says whether poses are to follow it.
+        When one cannot be read (`read_sweep`), when two show the same pictures, when their poses
+        are in different frames, or when the patient's reference moves and nothing says whether
+        poses are to follow it.
     """
     given = files.probe_from_image
     calibration = None if given is None else np.array(given, dtype=float)
     sweeps = [read_sweep(path, files.pose_frame, calibration) for path in files.sweeps]
+    _require_own_pictures(files.sweeps, sweeps)
     folder, first = files.sweeps[0].parent, sweeps[0]
     other = next((one for one in sweeps if one.pose_frame != first.pose_frame), None)
     if other:
@@ -108,6 +111,22 @@ def read_sweeps(files: UltrasoundFiles) -> list[Sweep]:
         probe_mm = np.concatenate([sweep.tracker_from_probe[:, :3, 3] for sweep in sweeps])
         require_resting(seen, probe_mm.mean(axis=0), str(folder))
     return sweeps
+
+
+def _require_own_pictures(paths: Sequence[Path], sweeps: Sequence[Sweep]) -> None:
+    """Refuse a sweep half of whose pictures, or more, are another's to the bit."""
+    shown = [
+        [hash(picture.tobytes()) for picture in sweep.images if np.ptp(picture) > 0]
+        for sweep in sweeps
+    ]
+    for (one, mine), (other, theirs) in combinations(zip(paths, shown, strict=True), 2):
+        few, many = sorted((mine, theirs), key=len)
+        shared = len(few) - sum(picture not in set(many) for picture in few)
+        if few and shared >= len(few) / 2:
+            raise InputError(
+                f"{other}: {shared} of its pictures are those of {one} to the bit, which makes one "
+                "recording count as two; name one of both under us.sweeps in study.yaml"
+            )
 
 
 def read_sweep(

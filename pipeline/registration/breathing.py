@@ -32,6 +32,11 @@ _USUAL_MM = 6.0
 # Most of a breath is spent near its end: this share of the frames lies at or before it.
 _AT_REST = 0.25
 _ROUNDS = 3
+# By what share of a breath that may be off: breaths of the form cos^2n (Lujan et al., Med Phys 26
+# (1999) 715-720) have their quarter at 0.15 of their depth for n = 1, and at the end for n = 3.
+_REST_SD = 0.1
+# A breath this deep whose middle frame lies so far towards its end does not rest at its beginning.
+_DEEP_MM, _INSPIRED = 2.0, 0.6
 
 
 def follow_breath(
@@ -67,6 +72,21 @@ def follow_breath(
         at_rest[:3, 3] = -rest_mm * AXIS
         pose = climb(placed, at_rest @ pose, pivot)
     return placed, pose, depth_mm
+
+
+def rest_error_mm(breath_mm: Float) -> float:
+    """Standard deviation, along `AXIS`, of where the heart rests between breaths.
+
+    ``breath_mm``: ``(frames,)`` as `follow_breath` returns them.
+    """
+    return _REST_SD * float(np.ptp(np.quantile(breath_mm, [0.05, 0.95])))
+
+
+def is_mostly_inspired(breath_mm: Float) -> bool:
+    """Whether most frames were taken nearer to the end of inspiration, so that it is not plain
+    where the heart rests."""
+    low, middle, high = np.quantile(breath_mm, [0.05, 0.5, 0.95])
+    return bool(high - low > _DEEP_MM and middle - low > _INSPIRED * (high - low))
 
 
 def _costs_along(level: Level, pose: Float) -> Float:

@@ -49,12 +49,18 @@ class Pivot:
         motion[:3, 3] = self.centre_mm - rotation @ self.centre_mm + step_mm[:3]
         return np.asarray(motion @ mr_from_tracker)
 
+    def step_between(self, mr_from_tracker: Float, other: Float) -> Float:
+        """``(6,)`` the step by which `move` brings a pose to another."""
+        motion = other @ np.linalg.inv(mr_from_tracker)
+        shift_mm = transform_points(motion, self.centre_mm) - self.centre_mm
+        turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+        return np.concatenate([shift_mm, turn * self.lever_mm])
+
     def distance(self, pose: Float, other: Float) -> tuple[float, float]:
         """How far two poses lie apart: shift of the pivot in millimetres, and degrees."""
-        motion = pose @ np.linalg.inv(other)
-        shift = transform_points(motion, self.centre_mm) - self.centre_mm
-        angle = Rotation.from_matrix(motion[:3, :3]).magnitude()
-        return float(np.linalg.norm(shift)), float(np.degrees(angle))
+        step_mm = self.step_between(other, pose)
+        turn = np.linalg.norm(step_mm[3:]) / self.lever_mm
+        return float(np.linalg.norm(step_mm[:3])), float(np.degrees(turn))
 
 
 def pivot_of(surfaces: Sequence[MovingSurface]) -> Pivot:

@@ -111,11 +111,13 @@ class Search:
     phases: Sequence[Float]
     settings: RegisterSettings
 
-    def coarse_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
-        """Few frames, few samples, thick blur."""
+    def coarse_level(self, sweeps: Sequence[TrackedSweep], numbers: Integer | None = None) -> Level:
+        """Few frames, few samples, thick blur; of the frames of these numbers alone, if any."""
         lengths_mm = _COARSE_SPACING_MM, _COARSE_BLUR_MM, _COARSE_TREND_MM
-        samples = sample_frames(sweeps, self.phases, *lengths_mm)
-        return Level(samples, self.coarse).thinned(_COARSE_FRAMES)
+        level = Level(sample_frames(sweeps, self.phases, *lengths_mm), self.coarse)
+        if numbers is not None:
+            level = level.only(np.flatnonzero(np.isin(level.samples.number, numbers)))
+        return level.thinned(_COARSE_FRAMES)
 
     def fine_level(self, sweeps: Sequence[TrackedSweep]) -> Level:
         """All frames as the settings ask for them."""
@@ -146,10 +148,12 @@ class Search:
 
     def best(self, sweeps: Sequence[TrackedSweep]) -> Best:
         """The pose at which the frames agree best with the model."""
-        coarse = self.coarse_level(sweeps)
+        return self.best_of(self.coarse_level(sweeps), self.fine_level(sweeps))
+
+    def best_of(self, coarse: Level, fine: Level) -> Best:
+        """The same, of frames at either degree of blur."""
         starts = self.settings.starts * (_MORE_STARTS if self.start is None else 1)
         rivals = climb_from_best(coarse, self.candidates(coarse), self.pivot, starts, kept=_RIVALS)
-        fine = self.fine_level(sweeps)
         few = fine.thinned(_RIVAL_FRAMES)
         finalists = sorted(rivals, key=few.score, reverse=True)[:_FINALISTS]
         refined = [climb(few, rival, self.pivot, ROUGHLY_MM) for rival in finalists]

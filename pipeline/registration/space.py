@@ -17,7 +17,12 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
 from pipeline.progress import Progress
-from pipeline.registration.breathing import follow_breath
+from pipeline.registration.breathing import (
+    AXIS,
+    follow_breath,
+    is_mostly_inspired,
+    rest_error_mm,
+)
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import (
     ClockOffset,
@@ -27,6 +32,7 @@ from pipeline.registration.clock_offset import (
     settle_clock,
 )
 from pipeline.registration.correction import Correction
+from pipeline.registration.dissent import Dissent, contradicting, dissent, longest_astray, outvoted
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.in_view import LEAST_IN_VIEW, require_frames, require_heart_in_view
 from pipeline.registration.misplaced import by_chance
@@ -52,8 +58,6 @@ from pipeline.registration.verdict import (
     Grade,
     Verdict,
     judge,
-    longest_astray,
-    outvoted,
 )
 
 # A frame that the model explains less than this share of the usual shows something else.
@@ -151,6 +155,7 @@ class _Found:
 
     size: Size
     apart: Apart
+    dissent: Dissent
     clocks: ClocksApart | None
     misplaced: str
     """See `Evidence`."""
@@ -259,11 +264,12 @@ def find(
     judged = _judged(everything, bears_out, settings)
     size = fitting_size(judged, pose, search.pivot, planes_of(cine))
     apart = _apart(everything, pose, search.pivot, sizes)
+    contradicted = _dissent(search, compared, everything, pose, bears_out, sizes)
     looked_at = timing if settings.clock_offset != "ignore" else None
     clocks = clocks_apart(everything, pose, search.pivot, looked_at)
     found = _Found(
         pose, confidence, rival, settled.clock, everything, calibration, breath_mm, bears_out,
-        size, apart, clocks, misplaced,
+        size, apart, contradicted, clocks, misplaced,
     )  # fmt: skip
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
     result = _summarise(found, search, sizes, heart_mm)
@@ -356,6 +362,8 @@ def _covariance(
     floor += in_radians(found.size.error_mm**2 * np.eye(6), search.pivot)
     if found.apart.gain > APART:
         floor += in_radians(found.apart.spread_mm2, search.pivot)
+    floor += in_radians(found.dissent.spread_mm2, search.pivot)
+    floor[:3, :3] += rest_error_mm(found.breath_mm) ** 2 * np.outer(AXIS, AXIS)
     if found.calibration is None:
         return np.asarray(spread + floor), ()
     opened, corrections = certainty(found.calibration, judged, found.pose, search.settings)
@@ -402,8 +410,26 @@ def _summarise(
 
 def _apart(level: Level, pose: Float, pivot: Pivot, sizes: Sequence[int]) -> Apart:
     """How parts of the recording, of frames that show the heart, differ."""
-    shows = level.only(np.flatnonzero(level.at(pose).in_view > LEAST_IN_VIEW))
+    shows = level.only(np.flatnonzero(_shows_heart(level, pose)))
     return parts_apart(shows, pose, pivot, shows.samples.sweep(sizes))
+
+
+def _dissent(
+    search: Search,
+    sweeps: Sequence[TrackedSweep],
+    level: Level,
+    pose: Float,
+    bears_out: Mask,
+    sizes: Sequence[int],
+) -> Dissent:
+    """What the frames agree on that contradict the pose."""
+    sweep, least = level.samples.sweep(sizes), search.settings.min_frames
+    against = contradicting(sweep, _shows_heart(level, pose), bears_out, least)
+    return dissent(search, sweeps, level, pose, bears_out, against)
+
+
+def _shows_heart(level: Level, pose: Float) -> Mask:
+    return np.asarray(level.at(pose).in_view > LEAST_IN_VIEW)
 
 
 def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
@@ -411,20 +437,22 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
     shift_mm, turn_deg = (
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
-    sweep, shows = level.samples.sweep(sizes), level.at(found.pose).in_view > LEAST_IN_VIEW
+    sweep, shows = level.samples.sweep(sizes), _shows_heart(level, found.pose)
     evidence = Evidence(
         confidence=found.confidence,
         rival=found.rival,
         expected_mm=expected_mm,
         valid=int(found.bears_out.sum()),
-        # A frame that shows no body, or has no pose, speaks neither for a result nor against it.
-        frames=level.samples.frames,
+        # A frame that shows no body, or not the heart, speaks neither for a result nor against it.
+        frames=int(shows.sum()),
         shift_mm=shift_mm,
         turn_deg=turn_deg,
         outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
+        elsewhere_mm=found.dissent.away_mm,
         apart=found.apart.gain,
+        inspired=is_mostly_inspired(found.breath_mm),
         clocks=found.clocks,
         misplaced=found.misplaced,
     )
