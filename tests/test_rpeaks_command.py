@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,5 +126,11 @@ def test_a_rhythm_in_which_forces_are_withheld_is_told_of_a_study():
     usual = [row("normal", math.nan), *[row("normal", 0.8)] * 15]
     assert unordered([*usual, *[row("ectopic", 0.5)] * 4]) == ""
     said = unordered([*usual, *[row("ectopic", 0.5)] * 2, *[row("irregular", 1.31)] * 3])
-    assert said == "of 21 beats 2 are ectopic and 3 irregular, 0.50 to 1.31 s apart"
+    counted = "of 21 beats 2 are ectopic and 3 irregular, at 21 the phase is valid"
+    assert said == f"{counted}, 0.50 to 1.31 s apart"
     assert unordered([]) == ""
+    # Where no two intervals agree from the first beat on, no beat is told as early.
+    unsure = [replace(one, valid=False) for one in usual]
+    assert "0 are ectopic and 0 irregular, at 0 the phase is valid" in unordered(unsure)
+    # A rhythm is learnt for some beats.
+    assert unordered([*unsure[:6], *usual[:2]]) == ""
