@@ -130,19 +130,29 @@ def test_values_that_are_no_numbers_are_named_by_place(value: float) -> None:
         require_finite(cine, "here")
 
 
-def test_nan_about_what_was_recorded_is_dark_and_told() -> None:
+@pytest.mark.parametrize(("fill", "name"), [(np.nan, "NaN"), (-1024.0, "-1024")])
+def test_what_fills_up_about_what_was_recorded_is_dark_and_told(fill: float, name: str) -> None:
     """A disc of measurements, as of a field of view that was turned: what is in it stays."""
     cine = noisy(phases=3, slices=4)
     cine.intensity[1, 2, 3, 3] = -7.5
     y, x = np.mgrid[:6, :7]
     outside = np.hypot(x - 3, y - 2.5) > 3
-    spoilt = replace(cine, intensity=np.where(outside, np.nan, cine.intensity))
+    spoilt = replace(cine, intensity=np.where(outside, fill, cine.intensity))
     found, (remark,) = without_unrecorded(spoilt, "the cine")
     np.testing.assert_array_equal(found.intensity, np.where(outside, -7.5, cine.intensity))
     require_finite(found, "here")
-    assert np.isnan(spoilt.intensity).any()
+    np.testing.assert_array_equal(spoilt.intensity[0, 0, 0, 0], fill)
     assert f"{outside.mean():.1%} of the pixels, at the edge of 4 of 4 slices" in remark
+    assert f" are {name} in all phases" in remark
     assert remark.endswith("the darkest value, -7.5")
+    assert without_unrecorded(cine, "the cine") == (cine, ())
+
+
+def test_the_darkest_of_what_was_measured_fills_nothing_up() -> None:
+    """Noise about zero whose darkest pixels stay dark, as air is, or masked to nothing."""
+    cine = noisy(phases=3, slices=4)
+    cine.intensity[:] = np.abs(cine.intensity - 100)
+    cine.intensity[..., :2] = 0
     assert without_unrecorded(cine, "the cine") == (cine, ())
 
 

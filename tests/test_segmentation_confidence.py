@@ -388,4 +388,12 @@ def test_what_the_images_edge_cuts_off_is_told(blanked, place, cut):
     if blanked:
         labels, intensity = (np.roll(one, 20, axis=3) for one in (labels, intensity))
         intensity[..., :20] = labels[..., :20] = 0
-    assert cut_sideways(labels, intensity) == ({"right ventricle": 1} if cut else {})
+    expected = {"right ventricle": 1} if cut else {}
+    assert cut_sideways(labels, intensity) == expected
+    if blanked:
+        # Filled up with what is not the darkest, or by a spline that swings beside the edge.
+        shifted = np.where(intensity > 0, intensity - 30, 0)
+        assert cut_sideways(labels, shifted) == expected
+        swings = np.zeros_like(intensity)
+        swings[..., 16:20] = [0.2, -0.4, 0.8, -1.5]
+        assert cut_sideways(labels, intensity + swings) == expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from pipeline.geometry import Float32, Label
+from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.labels import LABELS
 
 BODIES: dict[str, tuple[str, ...]] = {
@@ -28,6 +28,11 @@ cuts fall in a straight line: two thirds are left two slices from its end. A tip
 EDGE, FEW = 2, 4
 """Pixels from the edge of an image within which what is cut off by it ends, and how many of a body
 may lie there for another reason."""
+
+
+FILLS, SWINGS = 0.2, 0.01
+"""Share of the pixels at the images' sides that a value has which fills them up, and of the range
+of all values by which what splines leave beside it may differ from it."""
 
 
 def cut_off(labels: Label) -> dict[str, dict[int, int]]:
@@ -57,15 +62,15 @@ def cut_off(labels: Label) -> dict[str, dict[int, int]]:
 def cut_sideways(labels: Label, intensity: Float32) -> dict[str, int]:
     """Which structures the edge of the images cuts off, ``{body: phases in which it does}``.
 
-    The edge is that of what was recorded: where pixels are the darkest throughout, as programs
-    leave them that blank surroundings, there is no image.
+    The edge is that of what was recorded: where pixels are blank throughout, as programs leave them
+    that turn, cut or mask images, there is no image.
 
     Parameters
     ----------
     labels, intensity
         ``(phase, z, y, x)`` on the cine's slices.
     """
-    seen = intensity.max(axis=0) > intensity.min()
+    seen = _not_blank(intensity)
     recorded = [ndimage.binary_fill_holes(one) for one in seen]
     rim = ~np.stack([ndimage.binary_erosion(one, iterations=EDGE) for one in recorded])
     found = {}
@@ -75,3 +80,15 @@ def cut_sideways(labels: Label, intensity: Float32) -> dict[str, int]:
         if phases:
             found[body] = phases
     return found
+
+
+def _not_blank(intensity: Float32) -> Mask:
+    """``(z, y, x)``: what differs in any phase from the value that fills the images' edge, by more
+    than a spline swings beside it; without such a value, from the darkest."""
+    sides = intensity[..., [0, -1], :], intensity[..., [0, -1]]
+    values, counts = np.unique(np.concatenate([one.ravel() for one in sides]), return_counts=True)
+    if counts.max() < FILLS * counts.sum():
+        return np.asarray(intensity.max(axis=0) > intensity.min())
+    low, high = np.percentile(intensity.ravel()[::7], [1, 99])
+    off = np.abs(intensity - values[counts.argmax()]).max(axis=0)
+    return np.asarray(off > SWINGS * (high - low))

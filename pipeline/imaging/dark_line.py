@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import THREADS
-from pipeline.imaging.inference import PlaneProbability, sampled_slice
+from pipeline.imaging.inference import PlaneProbability, darkest_grey, sampled_slice
 from pipeline.imaging.interpolation import ventricle_margin
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 
@@ -63,13 +63,12 @@ def end_at_dark_line(found: PlaneProbability, cine: Cine) -> None:
     own_mm = float(np.linalg.norm(cine.mr_from_index[:3, :2], axis=0).max())
     pixel_px = max(own_mm / found.view.pixel_mm, 1.0)
     slices, count = len(found.view.order), found.planes_a_slice
-    # Greys of a file that was shifted to a mean of 0 are no shares of the muscle's.
-    nothing = min(float(cine.intensity.min()), 0.0)
+    nothing = darkest_grey(cine.intensity)
 
     def one(place: tuple[int, int]) -> None:
         phase, number = place
         planes = found.value[phase, number * count : (number + 1) * count]
-        image = sampled_slice(cine, found.view, phase, number) - np.float32(nothing)
+        image = sampled_slice(cine, found.view, phase, number) - nothing
         _move_planes(planes, image, pixel_px, found.view.pixel_mm)
 
     with ThreadPoolExecutor(THREADS) as pool:

@@ -44,6 +44,10 @@ LEAST_HEIGHT_MM, THIN_MM = 30.0, 2.5
 """A stack of slices thinner than the second, as those of volumes are, holds no ventricle in less
 than the first: such is what is left of one whose header lost the distance of its slices."""
 
+FILL_GAP = 0.1
+"""Share of the range of all other values, without their extremes, by which a value that fills up
+images lies below them. Of what was measured the darkest has others close above it."""
+
 EXCHANGED, COMES_ROUND = 2.0, 1.5
 """Times by which neighbours are less alike than along the other axis, and the last is less like the
 first than neighbours are, where an axis of phases is one of slices. In 6 stacks of 6 to 25 phases
@@ -68,12 +72,13 @@ def require_finite(cine: Cine, where: str) -> None:
 
 
 def without_unrecorded(cine: Cine, where: str) -> tuple[Cine, tuple[str, ...]]:
-    """The cine with its darkest value in place of NaN about what was recorded, and a remark.
+    """The cine with its darkest value in place of what fills up about what was recorded, and a
+    remark.
 
-    Programs that turn or cut images fill up with NaN. Such pixels are those that are NaN in all
-    phases and reach the image's edge. What else is NaN stays so.
+    Programs that turn or cut images fill up with NaN, or with a value far below all others. Such
+    pixels are those that are so in all phases and reach the image's edge. What else is NaN stays.
     """
-    nan = np.isnan(cine.intensity)
+    nan, name = _filled(cine.intensity)
     if not nan.any():
         return cine, ()
     always: Mask = np.asarray(nan.all(axis=0))
@@ -82,7 +87,7 @@ def without_unrecorded(cine: Cine, where: str) -> tuple[Cine, tuple[str, ...]]:
     whole: Mask = np.asarray(always.all(axis=(1, 2)))
     shown = np.flatnonzero(~whole)
     around[[k for k in np.flatnonzero(whole) if len(shown) and shown[0] < k < shown[-1]]] = False
-    finite = cine.intensity[np.isfinite(cine.intensity)]
+    finite = cine.intensity[np.isfinite(cine.intensity) & ~nan]
     if not around.any() or not finite.size:
         return cine, ()
     dark = finite.min()
@@ -90,9 +95,24 @@ def without_unrecorded(cine: Cine, where: str) -> tuple[Cine, tuple[str, ...]]:
     many, slices = float(around.mean()), int(around.any(axis=(1, 2)).sum())
     remark = (
         f"{where}: {many:.1%} of the pixels, at the edge of {slices} of {len(around)} slices, are "
-        f"NaN in all phases: not recorded, and read as the darkest value, {dark:g}"
+        f"{name} in all phases: not recorded, and read as the darkest value, {dark:g}"
     )
     return replace(cine, intensity=intensity), (remark,)
+
+
+def _filled(intensity: Float32) -> tuple[Mask, str]:
+    """Where images hold what fills them up, if anything does, and its name."""
+    nan = np.isnan(intensity)
+    if nan.any():
+        return nan, "NaN"
+    fill = intensity.min()
+    lowest = intensity == fill
+    rest = intensity[~lowest]
+    if not np.isfinite(fill) or not rest.size:
+        return nan, "NaN"
+    low, high = np.percentile(rest[::7], [1, 99])
+    far = rest.min() - fill > FILL_GAP * (high - low) > 0
+    return (lowest, f"{fill:g}") if far else (nan, "NaN")
 
 
 def require_room_for_a_heart(cine: Cine, where: str) -> None:

@@ -81,6 +81,15 @@ class PlaneProbability:
         return self.value[phase, middle :: self.planes_a_slice]
 
 
+def darkest_grey(intensity: Float32) -> np.float32:
+    """What stands for no signal: one value in a hundred is darker.
+
+    Programs that shift grey values leave it anywhere; greys are shares of muscle's or blood's only
+    above it.
+    """
+    return np.float32(np.percentile(intensity.ravel()[::7], 1))
+
+
 def sampled_slice(cine: Cine, view: View, phase: int, number: int) -> Float32:
     """One slice's image on the view; where slices are thin, the average over a thickness."""
     together = max(1, round(THICKNESS_MM / view.slice_step_mm))

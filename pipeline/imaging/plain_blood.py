@@ -22,7 +22,7 @@ from scipy.sparse.linalg import spsolve
 from pipeline.geometry import Float32, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import THREADS
-from pipeline.imaging.inference import PlaneProbability, sampled_slice
+from pipeline.imaging.inference import PlaneProbability, darkest_grey, sampled_slice
 from pipeline.imaging.labels import LABELS, MUSCLE, most_probable
 
 RIGHT = LABELS["rv_cavity"]
@@ -70,8 +70,7 @@ def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
     What was background alone becomes chamber; a slice tells of its own planes.
     """
     count = found.planes_a_slice
-    # Greys of a file that was shifted to a mean of 0 are no shares of the blood's.
-    nothing = np.float32(min(float(cine.intensity.min()), 0.0))
+    nothing = darkest_grey(cine.intensity)
     whole = _whole_slices(found)
 
     def one(place: tuple[int, int]) -> None:
