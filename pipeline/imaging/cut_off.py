@@ -89,6 +89,9 @@ def _not_blank(intensity: Float32) -> Mask:
     values, counts = np.unique(np.concatenate([one.ravel() for one in sides]), return_counts=True)
     if counts.max() < FILLS * counts.sum():
         return np.asarray(intensity.max(axis=0) > intensity.min())
-    low, high = np.percentile(intensity.ravel()[::7], [1, 99])
-    off = np.abs(intensity - values[counts.argmax()]).max(axis=0)
-    return np.asarray(off > SWINGS * (high - low))
+    low, high = np.percentile(intensity.ravel()[::5], [1, 99])
+    fill, swing = values[counts.argmax()], SWINGS * (high - low)
+    seen = np.zeros(intensity.shape[1:], bool)
+    for phase in intensity:
+        seen |= np.abs(phase - fill) > swing
+    return seen

@@ -107,11 +107,13 @@ def _filled(intensity: Float32) -> tuple[Mask, str]:
         return nan, "NaN"
     fill = intensity.min()
     lowest = intensity == fill
-    rest = intensity[~lowest]
+    darkest = intensity.min(where=~lowest, initial=np.inf)
+    rest = intensity.ravel()[::5]
+    rest = rest[rest > fill]
     if not np.isfinite(fill) or not rest.size:
         return nan, "NaN"
-    low, high = np.percentile(rest[::7], [1, 99])
-    far = rest.min() - fill > FILL_GAP * (high - low) > 0
+    low, high = np.percentile(rest, [1, 99])
+    far = darkest - fill > FILL_GAP * (high - low) > 0
     return (lowest, f"{fill:g}") if far else (nan, "NaN")
 
 

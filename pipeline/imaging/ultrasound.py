@@ -121,7 +121,8 @@ def _require_own_pictures(paths: Sequence[Path], sweeps: Sequence[Sweep]) -> Non
     ]
     for (one, mine), (other, theirs) in combinations(zip(paths, shown, strict=True), 2):
         few, many = sorted((mine, theirs), key=len)
-        shared = len(few) - sum(picture not in set(many) for picture in few)
+        known = set(many)
+        shared = sum(picture in known for picture in few)
         if few and shared >= len(few) / 2:
             raise InputError(
                 f"{other}: {shared} of its pictures are those of {one} to the bit, which makes one "
