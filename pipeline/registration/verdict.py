@@ -225,8 +225,9 @@ def _doubts_of_parts(apart: float) -> list[str]:
         return []
     return [
         f"parts of the recording agree {apart:.0%} better with poses of their own: was the "
-        "patient, the tracker or the reference moved meanwhile, is the calibration or the pixel "
-        "size off, or do images lag behind the tracker's poses?"
+        "patient, the tracker or the reference moved meanwhile, was the breath not held "
+        "(register.breath), is the calibration or the pixel size off, or do images lag behind the "
+        "tracker's poses?"
     ]
 
 
