@@ -18,6 +18,7 @@ from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.dicom_files import told_from_notes
 from pipeline.imaging.faults import (
+    doubts_of_gaps,
     doubts_of_order,
     redraw_slices,
     require_different_images,
@@ -146,6 +147,14 @@ def test_what_fills_up_about_what_was_recorded_is_dark_and_told(fill: float, nam
     assert f" are {name} in all phases" in remark
     assert remark.endswith("the darkest value, -7.5")
     assert without_unrecorded(cine, "the cine") == (cine, ())
+
+
+@pytest.mark.parametrize(("step_mm", "told"), [(25.0, 0), (30.0, 1)])
+def test_slices_too_far_apart_are_told(step_mm: float, told: int) -> None:
+    mr_from_index = np.diag([1.5, 1.5, step_mm, 1])
+    remarks = doubts_of_gaps(replace(noisy(), mr_from_index=mr_from_index))
+    assert len(remarks) == told
+    assert all("30 mm apart" in remark for remark in remarks)
 
 
 def test_the_darkest_of_what_was_measured_fills_nothing_up() -> None:

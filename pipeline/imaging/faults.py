@@ -117,6 +117,17 @@ def _filled(intensity: Float32) -> tuple[Mask, str]:
     return (lowest, f"{fill:g}") if far else (nan, "NaN")
 
 
+def doubts_of_gaps(cine: Cine) -> tuple[str, ...]:
+    """A remark where slices lie so far apart that what is between them is a guess."""
+    step_mm = float(cine.spacing_mm[2])
+    if step_mm <= WIDEST_GAP_MM:
+        return ()
+    return (
+        f"the slices lie {step_mm:.0f} mm apart, wide enough for an apex or a valve plane between "
+        "two: surfaces and volumes there are a guess",
+    )
+
+
 def require_room_for_a_heart(cine: Cine, where: str) -> None:
     """Raise InputError where images are too small to show a heart: lengths are in another unit."""
     rows, columns = cine.intensity.shape[2:]

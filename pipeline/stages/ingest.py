@@ -13,6 +13,7 @@ from pipeline.imaging.cine import OTHER_RATE, Stack
 from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import Ecg, other_patient, patient_mark, read_ecg
 from pipeline.imaging.faults import (
+    doubts_of_gaps,
     doubts_of_order,
     redraw_slices,
     require_different_images,
@@ -75,6 +76,7 @@ def run(job: Job) -> dict[str, Any]:
             *stack.remarks,
             *told_of_views,
             *copies,
+            *doubts_of_gaps(cine),
             *doubts_of_order(stack.cine),
             *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, _timed(stack)),
             *_doubts_of_beat(job, stack, ecg),
