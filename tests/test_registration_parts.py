@@ -214,22 +214,58 @@ def test_frames_that_contradict_with_one_voice_leave_the_pose_open(seen):
     level = search.fine_level(sweeps)
     first = level.samples.sweep([24, 24]) == 0
     pose = recording.mr_from_tracker
-    found = dissent(search, sweeps, level, pose, first, ~first)
+    found = dissent(search, sweeps, level, pose, 1 - first.astype(int), first, ~first)
     if seen == "noise":
         assert found is NONE
         return
     after = pose @ np.linalg.inv(shifted(12))
     step = search.pivot.step_between(pose, after)
     np.testing.assert_allclose(search.pivot.move(pose, step), after, atol=1e-9)
-    # As truly as one sweep tells a pose.
-    assert found.away_mm == pytest.approx(np.linalg.norm(step[:3]), abs=1.5)
+    # Held a little everywhere, they go most of the way, and are half of all frames.
+    assert 0.7 < found.away_mm / np.linalg.norm(step[:3]) < 1.1
     most = np.linalg.eigh(found.spread_mm2)
-    assert most[0][-1] == pytest.approx(np.linalg.norm(step) ** 2 / 2, rel=0.3)
+    assert 0.7**2 < most[0][-1] / (np.linalg.norm(step) ** 2 / 2) < 1.1**2
     assert abs(most[1][:, -1] @ step) > 0.95 * np.linalg.norm(step)
 
 
 def test_a_few_frames_have_no_pose_of_their_own():
     level = Bowls(np.eye(6)[np.zeros(20, int)])
     few = np.arange(20) < 9
-    assert dissent(None, [], level, np.zeros(6), ~few, few) is NONE
-    assert dissent(None, [], level, np.zeros(6), np.zeros(20, bool), ~few) is NONE
+    sweep = np.zeros(20, int)
+    assert dissent(None, [], level, np.zeros(6), sweep, ~few, few) is NONE
+    assert dissent(None, [], level, np.zeros(6), sweep, np.zeros(20, bool), ~few) is NONE
+
+
+def test_ten_frames_that_hardly_turn_are_no_contradiction():
+    """They were not moved, and hold no six parameters: where they would slide is held."""
+    recording = record(seed=0, frames=40)
+    settings = RegisterSettings(
+        reading="grey", grid_mm=3.0, sample_spacing_mm=6.0, candidates=100, starts=4
+    )
+    search = prepare_search(recording.phases, moving_surfaces(), None, settings)
+    level, ten = search.fine_level(recording.sweeps), np.arange(80) >= 70
+    sweep = np.repeat([0, 1], 40)
+    pose = recording.mr_from_tracker
+    found = dissent(search, recording.sweeps, level, pose, sweep, ~ten, ten)
+    # Of eight times as many for the pose they make it unsure by less than a millimetre or two.
+    assert np.sqrt(np.trace(found.spread_mm2)) < 1.5
+
+
+def test_a_bump_is_told_and_leaves_the_pose_of_use():
+    """Twelve frames of 80 were taken while the patient lay 9 mm beside: they are told, with where
+    they lie, and the pose by the others is right, and expected so within what they leave open."""
+    recording, surfaces = record(seed=0, frames=40), moving_surfaces()
+    sweeps = moved(recording, lambda share: shifted(9 * (share > 67.5 / 79)))
+    settings = RegisterSettings(
+        reading="grey", grid_mm=3.0, sample_spacing_mm=6.0, candidates=60, starts=4
+    )
+    truth = recording.mr_from_tracker
+    found = find(sweeps, recording.phases, surfaces, truth, settings)
+    points_mm = surfaces["lv_endocardium"].vertices_mm[0]
+    off_mm = target_error_mm(found.mr_from_tracker, truth, points_mm).mean()
+    assert found.verdict == "doubtful"
+    assert "frames in a row of sweep 2 show the heart" in found.reason
+    assert "and agree on a place" in found.reason
+    # Twelve in eighty, held a little: the rest alone expect less than that.
+    least_mm = 0.7 * 9 * np.sqrt(12 / 80)
+    assert off_mm < 1 < least_mm < found.expected_mm < settings.worst_tre_mm

@@ -283,6 +283,7 @@ class TestVerdict:
         # A sweep that leaves the heart speaks for itself.
         in_view[~borne_out] = 0
         assert space._verdict(found, search, (40,), 1.0).grade == "good"
+        assert space._verdict(found, search, (20, 20), 1.0).grade == "good"
 
     def test_settings_refuse_bounds_that_cross(self):
         with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):
@@ -328,8 +329,10 @@ def test_frames_that_are_truly_misplaced_need_no_better_start():
     wrong = SOUND | {"confidence": 0.1, "shift_mm": 31.0}
     said = judge(Evidence(**wrong), RegisterSettings()).reason
     assert "give a better start" in said
-    said = judge(Evidence(**wrong, misplaced="mirrored"), RegisterSettings()).reason
-    assert "give a better start" not in said
+    said = judge(Evidence(**wrong, misplaced="mirrored"), RegisterSettings(min_confidence=0.05))
+    assert said.grade == "failed"
+    assert "give a better start" not in said.reason
+    assert "ended 31.0 mm" in said.reason
 
 
 def test_six_fitted_parameters_are_taken_off_the_frames():

@@ -397,3 +397,14 @@ def test_what_the_images_edge_cuts_off_is_told(blanked, place, cut):
         swings = np.zeros_like(intensity)
         swings[..., 16:20] = [0.2, -0.4, 0.8, -1.5]
         assert cut_sideways(labels, intensity + swings) == expected
+
+
+def test_a_dark_lung_at_the_images_side_is_no_edge():
+    """Of greys 0, 1 and 2, of 200 in blood, beside a ventricle."""
+    rng = np.random.default_rng(0)
+    intensity = rng.rayleigh(50.0, (8, 3, 64, 64)).astype(np.float32)
+    intensity[..., :20] = rng.choice([0, 1, 2], p=[0.6, 0.3, 0.1], size=(8, 3, 64, 20))
+    row, column = np.mgrid[:64, :64]
+    labels = np.zeros((8, 3, 64, 64), np.uint8)
+    labels[:, 1, np.hypot(row - 32, column - 28) < 8] = LABELS["rv_cavity"]
+    assert cut_sideways(labels, intensity) == {}

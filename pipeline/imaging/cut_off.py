@@ -30,9 +30,10 @@ EDGE, FEW = 2, 4
 may lie there for another reason."""
 
 
-FILLS, SWINGS = 0.2, 0.01
-"""Share of the pixels at the images' sides that a value has which fills them up, and of the range
-of all values by which what splines leave beside it may differ from it."""
+FILLS, SWINGS, STEADY = 0.2, 0.01, 0.005
+"""Share of the pixels at the images' sides that a value has in all phases which fills them up; and
+of the range of all values by which what splines leave beside it may differ from it, and between
+phases: noise differs more, even in the dark of a lung."""
 
 
 def cut_off(labels: Label) -> dict[str, dict[int, int]]:
@@ -83,15 +84,16 @@ def cut_sideways(labels: Label, intensity: Float32) -> dict[str, int]:
 
 
 def _not_blank(intensity: Float32) -> Mask:
-    """``(z, y, x)``: what differs in any phase from the value that fills the images' edge, by more
+    """``(z, y, x)``: what differs in any phase from the value that fills the images' sides, by more
     than a spline swings beside it; without such a value, from the darkest."""
-    sides = intensity[..., [0, -1], :], intensity[..., [0, -1]]
-    values, counts = np.unique(np.concatenate([one.ravel() for one in sides]), return_counts=True)
-    if counts.max() < FILLS * counts.sum():
-        return np.asarray(intensity.max(axis=0) > intensity.min())
-    low, high = np.percentile(intensity.ravel()[::5], [1, 99])
-    fill, swing = values[counts.argmax()], SWINGS * (high - low)
-    seen = np.zeros(intensity.shape[1:], bool)
-    for phase in intensity:
-        seen |= np.abs(phase - fill) > swing
-    return seen
+    most, least = intensity.max(axis=0), intensity.min(axis=0)
+    sides = np.s_[:, [0, -1], :], np.s_[:, :, [0, -1]]
+    top, low = (np.concatenate([one[side].ravel() for side in sides]) for one in (most, least))
+    values, counts = np.unique(top[top == low], return_counts=True)
+    if not len(values) or counts.max() < FILLS * len(top):
+        return np.asarray(most > intensity.min())
+    fill = values[counts.argmax()]
+    dark, bright = np.percentile(intensity[..., ::2, ::3], [1, 99])
+    off = np.maximum(most - fill, fill - least)
+    blank = (off <= SWINGS * (bright - dark)) & (most - least <= STEADY * (bright - dark))
+    return np.asarray(~blank)

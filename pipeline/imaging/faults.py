@@ -108,9 +108,9 @@ def _filled(intensity: Float32) -> tuple[Mask, str]:
     fill = intensity.min()
     lowest = intensity == fill
     darkest = intensity.min(where=~lowest, initial=np.inf)
-    rest = intensity.ravel()[::5]
+    rest = intensity[..., ::2, ::3]
     rest = rest[rest > fill]
-    if not np.isfinite(fill) or not rest.size:
+    if not np.isfinite([fill, intensity.max()]).all() or not rest.size:
         return nan, "NaN"
     low, high = np.percentile(rest, [1, 99])
     far = darkest - fill > FILL_GAP * (high - low) > 0

@@ -87,7 +87,7 @@ def darkest_grey(intensity: Float32) -> np.float32:
     Programs that shift grey values leave it anywhere; greys are shares of muscle's or blood's only
     above it.
     """
-    return np.float32(np.percentile(intensity.ravel()[::5], 1))
+    return np.float32(np.percentile(intensity[..., ::2, ::3], 1))
 
 
 def sampled_slice(cine: Cine, view: View, phase: int, number: int) -> Float32:

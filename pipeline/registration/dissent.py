@@ -1,9 +1,9 @@
 """Frames that show the heart and contradict the pose: how many, of which sweep, and what they say.
 
-Where the frames of a sweep do not bear out what those of another do, nothing tells which are right,
-and both may be wrong. So they are asked for the pose that suits them. Two poses of one recording
-are taken for two draws about the true one: half the square of the step between them is then what
-either is off on average.
+Where frames of a sweep do not bear out what the others do, nothing tells which are right, and both
+may be wrong. So they are asked for the pose that suits them. As many frames for one pose as for the
+other are two draws about the true one: half the square of the step between them is then what either
+is off on average. Fewer count by their share.
 """
 
 from __future__ import annotations
@@ -16,11 +16,15 @@ import numpy as np
 from pipeline.geometry import Float, Integer, Mask
 from pipeline.registration.frames import TrackedSweep
 from pipeline.registration.search import Level, Search
+from pipeline.registration.uncertainty import rising
 
 # Share of its frames up to which a sweep is against a pose, and from which it is for it.
 _AGAINST, _FOR = 0.25, 0.5
 # Fewer frames than this have no pose of their own: six parameters fit them by chance.
 _LEAST_FRAMES = 10
+# Of their mean curvature: what holds frames where they see little, as ten of a sweep that hardly
+# turn do. Where they would go without is no contradiction.
+_DAMPING = 0.1
 # A pose at which frames agree less than so many times as well as others do at the common one is
 # none: noise agrees somewhere, too.
 _LEAST_AGREEMENT = 0.5
@@ -96,7 +100,7 @@ def contradicting(sweep: Integer, shows: Mask, bears_out: Mask, least: int) -> M
     least
         As in `outvoted`.
     """
-    named = list(outvoted(sweep, bears_out, least))
+    named = list(outvoted(sweep[shows], bears_out[shows], least))
     in_a_row, number = longest_astray(sweep[shows], bears_out[shows])
     if in_a_row >= IN_A_ROW:
         named.append(number)
@@ -108,10 +112,14 @@ def dissent(
     sweeps: Sequence[TrackedSweep],
     level: Level,
     pose: Float,
+    sweep: Integer,
     bears_out: Mask,
     against: Mask,
 ) -> Dissent:
-    """What the frames that contradict a pose agree on; `NONE` where that is nothing.
+    """What the frames of each sweep that contradict a pose agree on; `NONE` where that is nothing.
+
+    The search begins with all frames where they were recorded; it ends where their breath and
+    their sweep's correction, if these were sought, have them.
 
     Parameters
     ----------
@@ -121,9 +129,28 @@ def dissent(
         All frames, as finely as they are judged.
     pose
         4x4 ``mr_from_tracker``, the common one.
-    bears_out, against
-        ``(frames,)`` of ``level``: which bear it out, and which contradict it.
+    sweep, bears_out, against
+        ``(frames,)`` of ``level``: number of each one's sweep, which bear the pose out, and which
+        contradict it.
     """
+    found = [
+        _of_one_sweep(search, sweeps, level, pose, bears_out, against & (sweep == number))
+        for number in np.unique(sweep[against])
+    ]
+    if not any(one.away_mm > 0 for one in found):
+        return NONE
+    spread_mm2 = np.sum([one.spread_mm2 for one in found], axis=0)
+    return Dissent(max(one.away_mm for one in found), spread_mm2)
+
+
+def _of_one_sweep(
+    search: Search,
+    sweeps: Sequence[TrackedSweep],
+    level: Level,
+    pose: Float,
+    bears_out: Mask,
+    against: Mask,
+) -> Dissent:
     if against.sum() < _LEAST_FRAMES or not bears_out.any():
         return NONE
     own = level.only(np.flatnonzero(against))
@@ -134,7 +161,17 @@ def dissent(
     agreed = np.median(level.only(np.flatnonzero(bears_out)).at(pose).explained)
     if np.median(own.at(other).explained) < _LEAST_AGREEMENT * agreed:
         return NONE
-    step = search.pivot.step_between(pose, other)
+    step = _held(own.expansion(other, search.pivot).bending) @ search.pivot.step_between(
+        pose, other
+    )
+    share = against.sum() / (against.sum() + bears_out.sum())
     # A turn moves what lies on its axis not at all: two thirds of the square are left.
     away_mm = np.sqrt((step[:3] ** 2).sum() + 2 / 3 * (step[3:] ** 2).sum())
-    return Dissent(float(away_mm), np.outer(step, step) / 2)
+    return Dissent(float(away_mm), np.outer(step, step) * share)
+
+
+def _held(bending: Float) -> Float:
+    """``(6, 6)``: the share of a step that is left where a little holds it everywhere."""
+    rises = rising(bending)
+    least = _DAMPING * np.trace(rises) / 6
+    return np.asarray(np.linalg.solve(rises + least * np.eye(6), rises)) if least > 0 else 0 * rises

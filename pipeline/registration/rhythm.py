@@ -21,9 +21,9 @@ _STEP_S = 0.02
 _NOT_NORMAL: tuple[Kind, Kind] = ("ectopic", "irregular")
 # Share of beats that are not normal, beyond which a rhythm is told of.
 _MANY = 0.2
-# Beats in which a rhythm is learnt, and the share of the others at which the phase is to be valid:
-# where intervals never agree, no beat is told as early.
-_LEARNT, _VALID = 6, 0.5
+# Beats in which a rhythm is learnt, and the share of the others, if so many, at which the phase is
+# to be valid: where intervals never agree, no beat is told as early.
+_LEARNT, _JUDGED, _VALID = 6, 10, 0.5
 _COLUMNS = ("time_s", "kind", "valid", "lead", "rr_s", "likeness", "known_s", "strange")
 
 
@@ -118,14 +118,14 @@ def unordered(beats: Sequence[RhythmBeat]) -> str:
     as was to be expected; else empty."""
     ectopic, irregular = (sum(one.kind == kind for one in beats) for kind in _NOT_NORMAL)
     valid = [one.valid for one in beats[_LEARNT:]]
-    expected = sum(valid) >= _VALID * len(valid)
+    expected = len(valid) < _JUDGED or sum(valid) >= _VALID * len(valid)
     if expected and ectopic + irregular <= _MANY * len(beats):
         return ""
     intervals_s = [one.rr_s for one in beats if math.isfinite(one.rr_s)]
+    apart = f", {min(intervals_s):.2f} to {max(intervals_s):.2f} s apart" if intervals_s else ""
     return (
         f"of {len(beats)} beats {ectopic} are ectopic and {irregular} irregular, at "
-        f"{sum(one.valid for one in beats)} the phase is valid, "
-        f"{min(intervals_s):.2f} to {max(intervals_s):.2f} s apart"
+        f"{sum(one.valid for one in beats)} the phase is valid{apart}"
     )
 
 

@@ -425,7 +425,7 @@ def _dissent(
     """What the frames agree on that contradict the pose."""
     sweep, least = level.samples.sweep(sizes), search.settings.min_frames
     against = contradicting(sweep, _shows_heart(level, pose), bears_out, least)
-    return dissent(search, sweeps, level, pose, bears_out, against)
+    return dissent(search, sweeps, level, pose, sweep, bears_out, against)
 
 
 def _shows_heart(level: Level, pose: Float) -> Mask:
@@ -447,7 +447,7 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         frames=int(shows.sum()),
         shift_mm=shift_mm,
         turn_deg=turn_deg,
-        outvoted=outvoted(sweep, found.bears_out, settings.min_frames),
+        outvoted=outvoted(sweep[shows], found.bears_out[shows], settings.min_frames),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
         elsewhere_mm=found.dissent.away_mm,

@@ -22,6 +22,11 @@ patient had drifted by 6 mm or more, or moved by 4 mm or turned by 6 degrees bet
 # doubt, and are a minority. Nine in ten did in each of 123 studies of two renderers.
 _FEW, _MINORITY = 0.75, 0.5
 
+_BETTER_START = (
+    "; give a better start (in LPS, where 3D Slicer shows RAS; of landmarks, the same point each "
+    "time) or widen capture_mm and capture_deg"
+)
+
 _WHERE_TO_LOOK = (
     "is the ECG of this recording, and are the calibration (were pictures cropped?), the "
     "transforms and the patient right?"
@@ -128,13 +133,12 @@ def _failures(evidence: Evidence, settings: RegisterSettings) -> list[str]:
     # The candidates reach as far as the capture range; an optimum may lie a little beyond.
     far = evidence.shift_mm > 1.5 * settings.capture_mm
     far = far or evidence.turn_deg > 1.5 * settings.capture_deg
-    if far and not _how_they_agree(evidence):
+    if far:
         reasons.append(
             f"registration ended {evidence.shift_mm:.1f} mm and {evidence.turn_deg:.1f} degrees "
             f"from the start, far outside the {settings.capture_mm:g} mm and "
-            f"{settings.capture_deg:g} degrees that were searched; give a better start (in "
-            "LPS, where 3D Slicer shows RAS; of landmarks, the same point each time) or widen "
-            "capture_mm and capture_deg"
+            f"{settings.capture_deg:g} degrees that were searched"
+            + ("" if _how_they_agree(evidence) else _BETTER_START)
         )
     if evidence.valid < settings.min_frames:
         reasons.append(
