@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
-from sweep_files import FRAMES, calibration, good_fields, rigid, text, write
+from sweep_files import FRAMES, PIXELS, calibration, good_fields, rigid, text, write
 
 from pipeline.errors import InputError
 from pipeline.imaging.ultrasound import read_sweep, read_sweeps, remarks_on
@@ -129,7 +129,7 @@ def test_a_reference_that_moves_between_sweeps_needs_a_choice(tmp_path):
         for k in range(FRAMES):
             name = f"Seq_Frame{k:04d}_ReferenceToTrackerTransform"
             fields[name] = text(reference(3 * number))
-        write(tmp_path / f"{number}.mha", fields)
+        write(tmp_path / f"{number}.mha", fields, PIXELS ^ number)
     read_sweeps(files(tmp_path / "0.mha"))
     with pytest.raises(InputError, match=r"Reference moves"):
         read_sweeps(files(tmp_path / "0.mha", tmp_path / "1.mha"))
@@ -167,7 +167,7 @@ def test_poses_in_the_references_frame_alone_are_taken_and_told(tmp_path):
     sweeps = read_sweeps(files(path))
     np.testing.assert_allclose(poses(sweeps), [followed(k) for k in range(FRAMES)])
     assert len(remarks_on(sweeps)) == 1
-    other = write(tmp_path / "t.mha", good_fields())
+    other = write(tmp_path / "t.mha", good_fields(), PIXELS ^ 1)
     with pytest.raises(InputError, match=r"s are in the frame Reference, those of t in Tracker"):
         read_sweeps(files(path, other))
     with pytest.raises(InputError, match=r"t\.mha, frame 0: has no ProbeToReferenceTransform"):
