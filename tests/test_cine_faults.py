@@ -22,16 +22,15 @@ from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
     require_different_images,
-    require_finite,
     require_room_for_a_heart,
     require_slices_before_phases,
     without_blank_ends,
-    without_unrecorded,
 )
 from pipeline.imaging.frames import Frame
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.phases import common_phases, doubts_of_phases
 from pipeline.imaging.stack_choice import choose_stack
+from pipeline.imaging.unrecorded import require_finite, without_unrecorded
 from pipeline.study import open_study
 from tests.outside_heart import Scan, render
 

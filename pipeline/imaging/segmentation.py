@@ -16,7 +16,7 @@ from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.cut_off import BODIES
 from pipeline.imaging.dark_line import end_at_dark_line
-from pipeline.imaging.faults import require_finite, require_room_for_a_heart
+from pipeline.imaging.faults import require_room_for_a_heart
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
@@ -36,6 +36,7 @@ from pipeline.imaging.lookalikes import (
 )
 from pipeline.imaging.plain_blood import settle_plain_blood
 from pipeline.imaging.settings import SegmentSettings
+from pipeline.imaging.unrecorded import require_finite
 from pipeline.imaging.view import Orientation, View
 from pipeline.progress import Progress
 

@@ -17,14 +17,13 @@ from pipeline.imaging.faults import (
     doubts_of_order,
     redraw_slices,
     require_different_images,
-    require_finite,
     require_slices_before_phases,
     without_blank_ends,
-    without_unrecorded,
 )
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.imaging.phases import doubts_of_phases
+from pipeline.imaging.unrecorded import require_finite, without_unrecorded
 from pipeline.job import Job
 from pipeline.products import write_cine
 from pipeline.registration.time import detect_r_peaks, median_rr_s
