@@ -163,8 +163,9 @@ def test_each_slice_moves_its_own_planes_by_its_own_image():
 
 
 @pytest.mark.parametrize("fat_mm", [0.0, 9.0])
-def test_greys_that_were_shifted_below_nought_give_the_same(fat_mm):
-    """As research formats have them; muscle is as good as 0 then, and no measure of what it was."""
+def test_greys_that_were_shifted_give_the_same(fat_mm):
+    """As research formats have them: muscle is as good as 0 then, or as bright as blood, and no
+    measure of what it was; and one pixel may be darker than nothing, as splines make it."""
     centre_mm = np.full(2, PIXEL_MM * SIDE / 2)
     noise = 0.02 * np.random.default_rng(1).normal(size=(SIDE, SIDE))
     picture = np.abs(image(26, centre_mm, 0.8, fat_mm) + noise)
@@ -172,12 +173,15 @@ def test_greys_that_were_shifted_below_nought_give_the_same(fat_mm):
     picture -= picture.min()
     planes = np.stack([drawn(27.5, 26, centre_mm)])
     moved = []
-    for shift in (0.0, MUSCLE_GREY):
-        found, cine = study([picture - shift], [planes])
+    for shift, lowest in ((0.0, 0.0), (MUSCLE_GREY, 0.0), (-20.0, 0.0), (0.0, -20.0)):
+        shown = picture - shift
+        shown[0, 0] += lowest
+        found, cine = study([shown], [planes])
         end_at_dark_line(found, cine)
         moved.append(found.value)
 
-    np.testing.assert_allclose(moved[0], moved[1], atol=1e-3)
+    for other in moved[1:]:
+        np.testing.assert_allclose(moved[0], other, atol=1e-3)
 
 
 def test_images_without_muscle_and_constant_ones_stay_as_they_are():

@@ -82,12 +82,13 @@ def test_a_chamber_goes_on_to_where_its_blood_ends(chamber):
     assert dice(found.value[0], chamber).min() > 0.97
 
 
-def test_greys_shifted_below_zero_change_nothing():
+@pytest.mark.parametrize("means", [-1.0, 5.0])
+def test_greys_that_were_shifted_change_nothing(means):
     found, cine = study()
     shifted, other = study()
-    low = Cine(other.intensity - other.intensity.mean(), other.mr_from_index, other.phases, 1.0)
+    greys = other.intensity + np.float32(means) * other.intensity.mean()
     settle_plain_blood(found, cine)
-    settle_plain_blood(shifted, low)
+    settle_plain_blood(shifted, Cine(greys, other.mr_from_index, other.phases, 1.0))
     assert dice(shifted.value[0]) == pytest.approx(dice(found.value[0]), abs=0.01)
 
 
