@@ -70,6 +70,21 @@ LONG_PR: Waves = (
 # T waves of wide beats are large and, in a slow heart, late.
 SLOW_WIDE: Waves = (*WIDE[:2], (0.41, 0.055, 0.90, -0.80))
 LONE_P: Waves = ((-0.16, 0.022, 0.35, 0.20),)
+# A tall beat that is narrow, and one of a ventricle beside which it is not.
+TALL: Waves = (
+    *P,
+    (0.0, 0.0135, 1.50, 1.07),
+    (0.034, 0.012, -1.00, -0.60),
+    (0.28, 0.05, 0.05, 0.10),
+)
+WIDER: Waves = ((0.0, 0.031, -1.56, -2.05), (0.075, 0.035, -0.78, -1.02), (0.36, 0.06, 0.78, 1.02))
+LOW: Waves = (
+    (-0.16, 0.022, 0.085, 0.034),
+    (0.0, 0.011, 0.425, 0.21),
+    (0.028, 0.010, -0.085, -0.17),
+    (0.30, 0.045, 0.085, 0.085),
+)
+TOWERING: Waves = ((0.0, 0.030, 2.0, 1.6), (0.075, 0.035, -1.0, -0.8), (0.36, 0.060, -0.8, -0.64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +269,12 @@ CASES = {
     "small ventricular premature": partial(_mixed, early=scaled(WIDE, 0.45)),
     "ventricular premature, tall T": partial(_mixed, early=WIDE_TALL_T),
     "ventricular on the T wave": partial(_mixed, early=WIDE_ON_T, ahead=(0.4, 0.47)),
+    "ventricular at the end of the T wave": partial(
+        _mixed, usual=TALL, early=WIDER, share=0.3, rr_s=0.71, ahead=(0.52, 0.56)
+    ),
+    "low among towering": partial(
+        _mixed, usual=LOW, early=TOWERING, share=0.3, rr_s=0.83, ahead=(0.5, 0.55)
+    ),
     "atrial premature": partial(_mixed, early=(*P, *QRS, *T)),
     "paced and own": partial(_mixed, usual=PACED, early=(*P, *QRS, *T), share=0.3),
     "bigeminy": partial(_alternating, one=NORMAL, other=WIDE, early_share=0.33),

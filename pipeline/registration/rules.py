@@ -25,8 +25,8 @@ usual RR interval is longer than the second, later by its root (Bazett, Heart 7:
 LATE_T_WAVE_S = 0.45
 """The same at most, and when a beat is overdue, for then the heart is slow."""
 FADE_S, LARGE = 0.15, 1.6
-"""Beats of another shape, or so large, are wide or have large T waves: after them what a wave needs
-falls to nothing in so long, not at once. No beat counts as larger for its T wave."""
+"""Wide beats, those of another shape and those so large have late or large T waves: after them what
+a wave needs falls to nothing in so long, not at once. No beat counts as larger for its T wave."""
 USUAL_WIDE = 0.36
 """Where the usual beat rises by less than this share of its height in ``RISE_S``, it is wide."""
 T_ENERGY, SHARP_ENERGY = 0.5, 0.3
@@ -72,14 +72,18 @@ the steepness that such a height should have, is an atrial wave up to the third 
 
 TINY, TINY_STEEP, TINY_THRESHOLD = 0.35, 1.7, 0.7
 """Where the usual beat is wide, P waves are the steeper ones for their height. What is under the
-first share of its height is one of them up to the third place, unless it is steeper for its height
-by the second factor, as narrow QRS complexes among wide ones are."""
+first share of its height is one of them up to the third place (that of atrial waves if it looks
+like the usual beat), unless it is steeper for its height by the second factor, as narrow QRS
+complexes among wide ones are."""
 
 # Of a ventricle, though its energy is low?
 WIDE_TALL, WIDE_ENERGY, WIDE_THRESHOLD = 0.5, 0.38, 0.1
 """A wave as tall as the first share of the usual beat is one of a ventricle from the third place
 on, if it has the second share of the energy that such a height should have: beats that creep
 through muscle (s.d. 25 to 35 ms) have half of it, T waves (40 to 60 ms) a fifth to a third."""
+EARLY_ENERGY = 0.48
+"""A wave as tall in the time of the T wave of a usual, narrow beat counts as sharp from this share
+of that energy on."""
 AGAIN, MOST_RESTLESS = 0.96, 0.2
 """It has to look, by this correlation, like the wave before it of which that was true, and what
 lies between beats to be lower than the second share of them: noise has such waves, too."""
@@ -115,7 +119,7 @@ SPAN_S, RISE_S = 0.060, 0.012
 @inner
 def is_beat(since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Whether a wave so long after a beat is too high for noise and for that beat's T wave."""
-    if height < _t_wave_bar(since_s, plan, s):
+    if height < _t_wave_bar(since_s, height, plan, s):
         return False
     if _is_wide(since_s, height, plan, s):
         return True
@@ -129,7 +133,8 @@ def resembles(at: int, since_s: float, height: float, plan: Plan, s: State) -> b
     wave = s.found[now.found]
     measure_beat(at, wave, plan, s)
     tiny = now.tall < TINY and now.steep < TINY_STEEP * now.tall and wave.likeness < OWN
-    if tiny and _are_wide(s) and not _exceeds(height, TINY_THRESHOLD, s):
+    place = TINY_THRESHOLD if wave.likeness < VERY_ALIKE else ATRIAL_THRESHOLD
+    if tiny and _are_wide(s) and not _exceeds(height, place, s):
         return False
     if wave.likeness < VERY_ALIKE:
         again = _is_wide(since_s, height, plan, s) and _came_before(s)
@@ -174,10 +179,10 @@ def _last_was_wide(s: State) -> bool:
 
 
 @inner
-def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
+def _t_wave_bar(since_s: float, height: float, plan: Plan, s: State) -> float:
     """Height that a wave so long after a beat needs to be none of its T wave."""
     now, until_s = s.now[0], _t_wave_until_s(s.now[0].overdue, plan, s)
-    sharp = now.steep >= DULL * now.tall
+    sharp = now.steep >= DULL * now.tall or _is_dense_early_beat(height, s)
     share = SHARP_ENERGY if sharp else T_ENERGY
     strange = now.rhythm.last_likeness < ALIKE and since_s < T_WAVE_S
     if strange and _is_duller_than_last(STRANGE_DULL, s):
@@ -190,7 +195,25 @@ def _t_wave_bar(since_s: float, plan: Plan, s: State) -> float:
         bar = min(bar, max(SHARP_ENERGY * last, T_FAR_HIGHER * now.rhythm.t_height))
     if since_s < until_s:
         return bar
-    return bar * (1.0 - (since_s - until_s) / FADE_S) if _last_was_wide(s) else 0.0
+    late = _last_was_wide(s) or _are_wide(s)
+    return bar * (1.0 - (since_s - until_s) / FADE_S) if late else 0.0
+
+
+@inner
+def _is_dense_early_beat(height: float, s: State) -> bool:
+    """Whether a wave after a usual, narrow beat has more energy for its height than T waves have.
+
+    Not among the first beats: those may be T waves, and what is usual be theirs.
+    """
+    rhythm = s.now[0].rhythm
+    usual = rhythm.last_likeness >= ALIKE and rhythm.beats > FIRST_BEATS
+    return usual and _is_dense(EARLY_ENERGY, height, s) and not _are_wide(s)
+
+
+@inner
+def _is_dense(energy: float, height: float, s: State) -> bool:
+    """Whether a wave is tall, and has this share of the energy that such a height should have."""
+    return bool(s.now[0].tall >= WIDE_TALL and height >= energy * s.now[0].tall)
 
 
 @inner
@@ -198,7 +221,7 @@ def _is_wide(since_s: float, height: float, plan: Plan, s: State) -> bool:
     """Whether a wave after the last beat's T wave is tall and wide, as beats of a ventricle are."""
     now = s.now[0]
     over_s = _t_wave_until_s(False, plan, s) + (FADE_S if _last_was_wide(s) else 0.0)
-    if now.tall < WIDE_TALL or height < WIDE_ENERGY * now.tall or now.between > MOST_RESTLESS:
+    if not _is_dense(WIDE_ENERGY, height, s) or now.between > MOST_RESTLESS:
         return False
     return since_s > over_s and _exceeds(height, WIDE_THRESHOLD, s)
 
