@@ -163,7 +163,22 @@ def cut_sideways_by(cut: dict[str, int], ingest: dict[str, Any]) -> list[str]:
 def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
     """Sentences on what speaks against labels or times, of the figures of two stages."""
     of_labels = *low_confidence(segment), *muscle_changes(segment)
-    return [*of_labels, *unequal_strokes(segment, surface), *odd_systole(surface)]
+    of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface), *crossings(surface)
+    return [*of_labels, *of_surfaces]
+
+
+def crossings(surface: dict[str, Any]) -> list[str]:
+    """A sentence where surfaces pass through themselves.
+
+    >>> crossings({"crossing_triangles": {"epicardium": 0, "heart": 4}})
+    ['surfaces: heart passes through itself (4 triangles over all phases); look at it']
+    """
+    counts = surface.get("crossing_triangles", {})
+    return [
+        f"surfaces: {name} passes through itself ({count} triangles over all phases); look at it"
+        for name, count in counts.items()
+        if count
+    ]
 
 
 def low_confidence(segment: dict[str, Any]) -> list[str]:

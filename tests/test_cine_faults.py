@@ -228,6 +228,15 @@ def test_slices_out_of_order_are_told_with_their_order(order: list[int]) -> None
     assert told.startswith(f"slices look as if their order were {right};")
 
 
+def test_a_blank_slice_has_no_place_in_the_order() -> None:
+    cine = beating_ball()
+    images = cine.intensity.copy()
+    images[:, 6] = 0
+    assert doubts_of_order(replace(cine, intensity=images)) == ()
+    (told,) = doubts_of_order(replace(cine, intensity=images[:, SWAPPED]))
+    assert told.startswith("slices look as if their order were 0 1 2 3 8 5 7 4 9 10 11;")
+
+
 @pytest.mark.parametrize("phases", [*range(12, 16), 20])
 @pytest.mark.parametrize("first", [0, 1])
 def test_phases_sorted_by_name_are_told(phases: int, first: int) -> None:

@@ -249,11 +249,14 @@ def doubts_of_order(cine: Cine) -> tuple[str, ...]:
     if slices <= MOST_ORDERED:
         plain = images - images.mean(axis=2, keepdims=True)
         plain /= np.maximum(np.linalg.norm(plain, axis=2, keepdims=True), 1e-9)
-        unlike = 1 - np.einsum("kip,kjp->ij", plain, plain) / phases
+        # A blank slice is as unlike one neighbour as another.
+        shown = np.flatnonzero(plain.any(axis=(0, 2)))
+        unlike = 1 - np.einsum("kip,kjp->ij", plain[:, shown], plain[:, shown]) / phases
         order, gain = _shortest(unlike, closed=False)
         if gain > SLICES_GAIN:
+            right = _listed(shown[order].tolist())
             doubts.append(
-                f"slices look as if their order were {_listed(order)}; if it is, surfaces and "
+                f"slices look as if their order were {right}; if it is, surfaces and "
                 "forces are wrong: store them from one end of the heart to the other"
             )
     if phases <= MOST_ORDERED:
