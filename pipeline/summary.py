@@ -171,11 +171,12 @@ def crossings(surface: dict[str, Any]) -> list[str]:
     """A sentence where surfaces pass through themselves.
 
     >>> crossings({"crossing_triangles": {"epicardium": 0, "heart": 4}})
-    ['surfaces: heart passes through itself (4 triangles over all phases); look at it']
+    ['surfaces: heart passes through itself (4 triangles over all phases); look before you use it']
     """
     counts = surface.get("crossing_triangles", {})
     return [
-        f"surfaces: {name} passes through itself ({count} triangles over all phases); look at it"
+        f"surfaces: {name} passes through itself ({count} triangles over all phases); look before "
+        "you use it"
         for name, count in counts.items()
         if count
     ]

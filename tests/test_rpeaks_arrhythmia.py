@@ -45,9 +45,10 @@ def test_beats_of_two_leads_are_found_and_nothing_else(case):
     assert extra <= 2
 
 
+@pytest.mark.parametrize("seed", [6, 7])
 @pytest.mark.parametrize("case", sorted(HARD))
-def test_hard_cases_lose_few_beats(case):
-    drawn = record(case, seed=7, duration_s=60.0)
+def test_hard_cases_lose_few_beats(case, seed):
+    drawn = record(case, seed, duration_s=60.0)
     found_s = np.array([beat.time_s for beat in find_beats(drawn.signal_mv, drawn.rate_hz)])
     pairs = matched(found_s, drawn.r_times_s)
     # Whatever is confused, four beats in five are the heart's own.
@@ -55,16 +56,17 @@ def test_hard_cases_lose_few_beats(case):
     assert (pairs >= 0).sum() > 0.8 * len(found_s)
 
 
-def test_early_beats_of_a_ventricle_are_no_t_waves_once_the_usual_beat_is_known():
+@pytest.mark.parametrize("case", ["ventricular at the end of the T wave", "low among towering"])
+def test_beats_unlike_their_neighbours_are_found_once_the_usual_beat_is_known(case):
+    """As many as are asked for in the scanner and in noise: 99 in 100."""
     missed, extra, beats = 0, 0, 0
     for seed in range(4):
-        drawn = record("ventricular at the end of the T wave", seed, duration_s=60.0)
+        drawn = record(case, seed, duration_s=120.0)
         found_s = np.array([one.time_s for one in find_beats(drawn.signal_mv, drawn.rate_hz)])
         pairs = matched(found_s, drawn.r_times_s)
         # Twelve beats are found by the twentieth, though every third be missed.
         missed, beats = missed + (pairs[20:] < 0).sum(), beats + len(pairs[20:])
         extra += len(found_s) - (pairs >= 0).sum()
-    # What the clock is asked to bear in arrhythmia: one in a hundred.
     assert missed <= beats / 100
     assert extra <= beats / 100
 
