@@ -16,6 +16,7 @@ from pipeline.surface.level_set import (
     smooth_level_set,
     smooth_union,
     volume_shift,
+    with_balls,
     with_necks,
     with_sign_of,
 )
@@ -210,6 +211,19 @@ def test_necks_leave_alone_what_is_in_one_piece():
     mask, _ = ball(6)
     level = smooth_level_set(mask, SPACING_MM, 1.5)
     assert with_necks(level, mask, 1.8, 60) is level
+
+
+def test_balls_joined_to_a_body_far_off_are_balls():
+    """Of a ball apart from the body the level is its distance, as far as a distance is of use."""
+    body = np.full((40, 30, 30), 50.0, np.float32)
+    centre_mm = SPACING_MM * np.array([14.4, 15.2, 24.7])
+    level = with_balls(LevelSet(body, SPACING_MM), centre_mm[None], 4.0)
+    z, y, x = np.indices(body.shape)
+    away_mm = np.linalg.norm(SPACING_MM * np.stack([x, y, z], axis=-1) - centre_mm, axis=-1)
+    near = away_mm < 4 + 8 * SPACING_MM
+    np.testing.assert_allclose(level.distance_mm[near], away_mm[near] - 4, atol=1e-5)
+    assert (level.distance_mm[away_mm > 40] == 50).all()
+    assert (body == 50).all()
 
 
 def test_specks_are_not_joined():

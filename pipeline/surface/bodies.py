@@ -12,23 +12,25 @@ from pipeline.geometry import Float, Float32, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
 from pipeline.surface.correspondence import Across
 from pipeline.surface.level_set import (
+    OF_USE_VOXELS,
     LevelSet,
     enclosed_mm3,
     smooth_level_set,
     smooth_union,
+    with_balls,
     with_necks,
     with_sign_of,
 )
+from pipeline.surface.mesh import marched_nodes
 from pipeline.surface.settings import SurfaceSettings
 from pipeline.surface.solid import largest_piece, one_piece
 
 # A body below this many voxels is gone after smoothing.
 FEWEST_VOXELS = 60
-# Voxels of room round a body: as far as a distance is still of use.
-MARGIN_VOXELS = 8
 # Tries at one heart of parts that lie apart; wider seams would change the shape all over.
 BLEND_WIDENINGS = (1.0, 1.5, 2.0)
-
+# Rounds of plugging tunnels; one is nearly always enough.
+PLUGGINGS = 3
 # Radius of a neck, in edges of triangles, that marching cubes is sure to find.
 NECK_EDGES = 0.9
 
@@ -62,7 +64,7 @@ def cut_out(
     seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
     low, high = np.array([(lines[0], lines[-1] + 1) for lines in seen]).T
     cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    padded = np.pad(cut, [(0, 0)] + [(MARGIN_VOXELS, MARGIN_VOXELS)] * 3)
+    padded = np.pad(cut, [(0, 0)] + [(OF_USE_VOXELS, OF_USE_VOXELS)] * 3)
     masks = [one_piece(mask) for mask in padded]
 
     def smooth(mask: Mask) -> LevelSet:
@@ -72,12 +74,19 @@ def cut_out(
     return Body(
         tuple(smooth(mask) for mask in masks),
         tuple(float(np.count_nonzero(mask)) * spacing_mm**3 for mask in masks),
-        (low - MARGIN_VOXELS)[::-1],
+        (low - OF_USE_VOXELS)[::-1],
     )
 
 
-def joined(bodies: Sequence[Body], blend_mm: float, phases: Float, across: Across) -> Body:
-    """Bodies taken together, the seams between them bridged, as widely as one piece needs."""
+def joined(
+    bodies: Sequence[Body], phases: Float, settings: SurfaceSettings, across: Across
+) -> Body:
+    """Bodies taken together, the seams between them bridged, as widely as one piece needs.
+
+    Tunnels between them are plugged: open in one phase and closed in the next, they would fold any
+    mesh that goes through the beat.
+    """
+    blend_mm = settings.heart_blend_mm
     spacing_mm = bodies[0].levels[0].spacing_mm
     first = np.min([body.first_index for body in bodies], axis=0)
     for widening in BLEND_WIDENINGS:
@@ -92,11 +101,26 @@ def joined(bodies: Sequence[Body], blend_mm: float, phases: Float, across: Acros
             f"for seams of {blend_mm} mm to bridge"
         )
 
-    def mended(k: int) -> Float32:
-        return with_sign_of(unions[k], one_piece(unions[k] < 0), spacing_mm)
+    def mended(k: int) -> LevelSet:
+        solid = with_sign_of(unions[k], one_piece(unions[k] < 0), spacing_mm)
+        return _without_tunnels(LevelSet(solid, spacing_mm), settings.edge_mm)
 
-    levels = tuple(LevelSet(union, spacing_mm) for union in across(mended, range(len(unions))))
+    levels = tuple(across(mended, range(len(unions))))
     return Body(levels, tuple(enclosed_mm3(level) for level in levels), first)
+
+
+def _without_tunnels(level: LevelSet, edge_mm: float) -> LevelSet:
+    """The level set with plugs in all tunnels that marching cubes would find, as far as it goes.
+
+    Its grid is coarser than the voxels: a plug that is one voxel thick slips through.
+    """
+    for _ in range(PLUGGINGS):
+        distance_mm, step_mm = marched_nodes(level, edge_mm)
+        plugs = np.argwhere(one_piece(distance_mm < 0) & (distance_mm >= 0)).astype(float)
+        if not len(plugs):
+            break
+        level = with_balls(level, step_mm * plugs[:, ::-1], step_mm)
+    return level
 
 
 def _unions(
@@ -120,7 +144,7 @@ def _is_in_pieces(mask: Mask) -> bool:
 
 def _in_room(level: LevelSet, corner: Integer, shape: Integer) -> Float32:
     """Distances of a body in a larger array; ``corner`` and ``shape`` are ``(x, y, z)``."""
-    far_mm = MARGIN_VOXELS * level.spacing_mm
+    far_mm = OF_USE_VOXELS * level.spacing_mm
     room = np.full(tuple(shape[::-1]), far_mm, dtype=np.float32)
     ends = corner + level.distance_mm.shape[::-1]
     x, y, z = (slice(start, end) for start, end in zip(corner, ends, strict=True))

@@ -277,7 +277,7 @@ def _follow_heart(
     parts: Sequence[_Followed], phases: Float, settings: SurfaceSettings, across: Across
 ) -> _Followed:
     """The outer surface of all parts, which goes where they go."""
-    body = joined([part.body for part in parts], settings.heart_blend_mm, phases, across)
+    body = joined([part.body for part in parts], phases, settings, across)
     reference = nearest_phase(phases, settings.reference_phase)
     within_mm = _vertices_in(body, parts)
     template = extract_surface(body.levels[reference], settings.edge_mm)
@@ -306,7 +306,7 @@ def _finished(
             if apart is vertices:
                 return vertices, tries > 0, 0
             # Bringing the volume back may press together what was just opened.
-            apart = uncrossed(apart, triangles, level)
+            apart = untangled(uncrossed(apart, triangles, level), triangles, level)
             vertices = restore_volume(apart, triangles, volume_mm3)
             crossing = int(np.count_nonzero(crossing_triangles(vertices, triangles)))
         return vertices, True, crossing

@@ -18,6 +18,8 @@ from pipeline.surface.kernels import sample
 
 # A blurred mask tells the distance out to about 3 standard deviations, where 32 bits run out.
 NEAR, FAR = 1.5, 2.5
+# Voxels out to which a distance is of use: the room that is left round a body.
+OF_USE_VOXELS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,6 @@ def with_necks(level: LevelSet, mask: Mask, radius_mm: float, fewest_voxels: int
     inside = mask | (pieces == body)
     ways = MCP_Geometric(np.where(inside, 1 + np.maximum(level.distance_mm, 0), np.inf))
     costs, _ = ways.find_costs(np.argwhere(pieces == body))
-    distance_mm = level.distance_mm
     for number in np.flatnonzero(sizes >= fewest_voxels) + 1:
         ends = np.argwhere((pieces == number) & np.isfinite(costs))
         if number == body or not len(ends):
@@ -104,17 +105,27 @@ def with_necks(level: LevelSet, mask: Mask, radius_mm: float, fewest_voxels: int
         way = ndimage.gaussian_filter1d(
             np.array(ways.traceback(nearest), float), 1.0, axis=0, mode="nearest"
         )
-        tube_mm = _away_mm(way, distance_mm.shape, level.spacing_mm) - radius_mm
-        distance_mm = smooth_union([distance_mm, tube_mm], level.spacing_mm)
-    return LevelSet(distance_mm, level.spacing_mm)
+        centres = np.concatenate([way, (way[1:] + way[:-1]) / 2])
+        level = with_balls(level, level.spacing_mm * centres[:, ::-1], radius_mm)
+    return level
 
 
-def _away_mm(way: Float, shape: tuple[int, ...], spacing_mm: float) -> Float32:
-    """Distance of every voxel from the points ``(n, 3)`` of a way, in index coordinates."""
-    grid = np.indices(shape).reshape(3, -1).T
-    steps = np.concatenate([way, (way[1:] + way[:-1]) / 2])
-    away = np.asarray(spatial.cKDTree(steps).query(grid)[0])
-    return np.asarray(spacing_mm * away.reshape(shape), np.float32)
+def with_balls(level: LevelSet, centres_mm: Float, radius_mm: float) -> LevelSet:
+    """The level set with balls of one radius about points ``(n, 3)`` joined smoothly to it.
+
+    Farther from them than a distance is of use, it stays as it is.
+    """
+    distance_mm, spacing_mm = level.distance_mm.copy(), level.spacing_mm
+    centres = centres_mm[:, ::-1] / spacing_mm
+    room = radius_mm / spacing_mm + OF_USE_VOXELS
+    low = np.maximum(np.floor(centres.min(axis=0) - room).astype(int), 0)
+    high = np.minimum(np.ceil(centres.max(axis=0) + room).astype(int) + 1, distance_mm.shape)
+    box = tuple(slice(start, stop) for start, stop in zip(low, high, strict=True))
+    voxels = np.indices(tuple(high - low)).reshape(3, -1).T + low
+    away = np.asarray(spatial.cKDTree(centres).query(voxels)[0]).reshape(high - low)
+    balls_mm = np.asarray(spacing_mm * away - radius_mm, np.float32)
+    distance_mm[box] = smooth_union([distance_mm[box], balls_mm], spacing_mm)
+    return LevelSet(distance_mm, spacing_mm)
 
 
 def volume_shift(distance_voxels: Float | Float32, volume_voxels: float) -> float:

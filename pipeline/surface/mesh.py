@@ -19,7 +19,7 @@ from pipeline.surface.level_set import LevelSet
 # over all directions); equilateral triangles with that density have edges of 0.877 h.
 EDGE_PER_STEP = (2 / np.sqrt(3) / 1.5) ** 0.5
 RELAXATIONS = 30
-UNTANGLINGS = 20
+UNTANGLINGS = 40
 # Rounds after which one more ring of vertices takes part.
 WIDENING_ROUNDS = 4
 SLIVER_QUALITY = 0.3
@@ -37,7 +37,7 @@ def extract_surface(level: LevelSet, edge_mm: float) -> Surface:
     StageError
         When the level set has no zero level, or its surface is not closed.
     """
-    surface = largest_component(_march(level, edge_mm / EDGE_PER_STEP))
+    surface = largest_component(_march(level, edge_mm))
     if len(surface.boundary_edges()):
         raise StageError(
             f"marching cubes left {len(surface.boundary_edges())} open edges on a surface of "
@@ -46,12 +46,27 @@ def extract_surface(level: LevelSet, edge_mm: float) -> Surface:
     return _relaxed(surface, level)
 
 
-def _march(level: LevelSet, step_mm: float) -> Surface:
-    """Marching cubes on a grid of its own step, vertices in the level set's millimetres."""
+def marched_nodes(level: LevelSet, edge_mm: float) -> tuple[Float, float]:
+    """What marching cubes reads for triangles with edges of ``edge_mm``.
+
+    Returns
+    -------
+    distance_mm
+        ``(z, y, x)`` at nodes of a grid of its own.
+    step_mm
+        Of that grid; its first node is the level set's first voxel.
+    """
+    step_mm = float(edge_mm / EDGE_PER_STEP)
     extent_mm = (np.array(level.distance_mm.shape) - 1) * level.spacing_mm
     counts = np.maximum(np.ceil(extent_mm / step_mm).astype(int) + 1, 2)
     index = np.indices(tuple(counts)) * (step_mm / level.spacing_mm)
     field = ndimage.map_coordinates(level.distance_mm, index, order=1, mode="nearest")
+    return np.asarray(field), step_mm
+
+
+def _march(level: LevelSet, edge_mm: float) -> Surface:
+    """Marching cubes on a grid whose step suits the edge, vertices in millimetres."""
+    field, step_mm = marched_nodes(level, edge_mm)
     # A node exactly on the level would give several vertices in one place.
     field = np.where(np.abs(field) < 1e-3 * step_mm, 1e-3 * step_mm, field)
     if not (field.min() < 0 < field.max()):
