@@ -11,7 +11,7 @@ from pipeline.imaging.cleanup import (
     ventricle_tip,
 )
 
-SIDE, PIXEL_MM = 64, 1.5
+SIDE, PIXEL_MM, STEP_MM = 64, 1.5, 10 / 3
 CAVITY, MUSCLE, RV, ATRIUM = 1, 2, 3, 4
 Y, X = np.mgrid[:SIDE, :SIDE]
 RADIUS = np.hypot(X - 32, Y - 32)
@@ -240,10 +240,32 @@ def test_the_tip_is_the_same_in_every_phase():
     fat[0] = np.where(RADIUS < 15.9, MUSCLE, 0)
     value = one_hot(np.stack([fat, tapering, fat]))
     assert ventricle_tip(value, PIXEL_MM) == 1
-    clean_cycle(value, PIXEL_MM)
+    clean_cycle(value, PIXEL_MM, STEP_MM)
     ventricle = np.isin(value.argmax(axis=2), (CAVITY, MUSCLE))
     assert not ventricle[:, 0].any()
     assert ventricle[:, 1:].any(axis=(2, 3)).all()
+
+
+@pytest.mark.parametrize(
+    ("apart", "is_held"),
+    [((3,), True), ((3, 4), True), (range(3, 9), False), (range(1, 16), False)],
+    ids=["one phase", "two phases", "a long part of the beat", "all but one"],
+)
+def test_what_falls_apart_in_a_phase_and_is_whole_about_it_is_kept(apart, is_held):
+    """A ventricle with two of five planes aside is one body but for some of sixteen phases."""
+    heart = np.zeros((16, 5, SIDE, SIDE), np.uint8)
+    for phase in range(16):
+        radius = 7 if phase in apart else 10
+        for plane, place in enumerate((20, 20, 36, 36, 36)):
+            heart[phase, plane][np.hypot(X - place, Y - 32) < radius] = RV
+    value = np.stack([one_hot(one) for one in heart])
+    clean_cycle(value, PIXEL_MM, STEP_MM)
+    found = value.argmax(axis=2)
+    for phase in apart:
+        assert (found[phase, :2] == RV).any() == is_held
+        assert (found[phase, 2:] == heart[phase, 2:]).all()
+    whole = [phase for phase in range(16) if phase not in apart]
+    np.testing.assert_array_equal(found[whole], heart[whole])
 
 
 @pytest.mark.parametrize("phases", [1, 3])
@@ -251,7 +273,7 @@ def test_probabilities_still_sum_to_one(phases):
     rng = np.random.default_rng(0)
     value = np.moveaxis(rng.dirichlet(np.ones(7) / 3, (phases, 4, SIDE, SIDE)), -1, 2)
     value = value.astype(np.float32)
-    clean_cycle(value, PIXEL_MM)
+    clean_cycle(value, PIXEL_MM, STEP_MM)
     np.testing.assert_allclose(value.sum(axis=2), 1, atol=1e-4)
     assert value.min() >= 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
@@ -20,6 +20,11 @@ THREADS = 2
 
 NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
+
+HELD_BEATS, HELD_SHARE, HELD_MM3 = 0.12, 0.5, 300.0
+"""A piece beside a structure's body is no island if so much of the beat before it and after it that
+body lies in its place, by this share, and if it is so large: a slice taken far aside, in another
+breath-hold, parts a right ventricle while it is thin."""
 
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
@@ -48,11 +53,12 @@ STRAY_SHARE, BARE_SHARE = 0.3, 0.1
 """A cavity with less muscle about it is another chamber's, beside a ring and where none is."""
 
 
-def clean_cycle(value: Float32, pixel_mm: float) -> None:
+def clean_cycle(value: Float32, pixel_mm: float, step_mm: float) -> None:
     """Put the anatomy of all phases right, in place.
 
     Every phase is treated by `clean_probability`; the plane at which the left ventricle ends is
-    one for all phases, for its tip hardly moves while the base comes towards it.
+    one for all phases, for its tip hardly moves while the base comes towards it. What falls apart
+    in a phase, and is one body before it and after it, is kept whole.
 
     Parameters
     ----------
@@ -61,14 +67,50 @@ def clean_cycle(value: Float32, pixel_mm: float) -> None:
         background.
     pixel_mm
         Distance between rows and between columns.
+    step_mm
+        Distance between planes.
     """
     tip = ventricle_tip(value, pixel_mm)
-
-    def clean(phase: int) -> None:
-        value[phase] = clean_probability(value[phase], pixel_mm, tip)
-
+    fewest = HELD_MM3 / (pixel_mm**2 * step_mm)
     with ThreadPoolExecutor(THREADS) as pool:
+        drawn = list(pool.map(most_probable, value))
+        bodies = list(pool.map(_bodies, drawn))
+
+        def clean(phase: int) -> None:
+            held = _held(bodies, phase)
+            parted = (held > 0) & (drawn[phase] == held) & (bodies[phase] != held)
+            largest = np.bincount(held[parted], minlength=1).max()
+            value[phase] = clean_probability(
+                value[phase], pixel_mm, tip, held if largest >= fewest else None
+            )
+
         list(pool.map(clean, range(len(value))))
+
+
+def _bodies(labels: Label) -> Label:
+    """Labels of every structure's largest body alone."""
+    bodies = np.zeros_like(labels)
+    for value in LABELS.values():
+        bodies[_largest_body(labels == value)] = value
+    return bodies
+
+
+def _held(bodies: Sequence[Label], phase: int) -> Label:
+    """Structures whose bodies lie at a place both before a phase and after it; else 0."""
+    count = len(bodies)
+    reach = min(max(round(HELD_BEATS * count), 1), (count - 1) // 2)
+    held = np.zeros_like(bodies[phase])
+    if reach == 0:
+        return held
+    for value in LABELS.values():
+        before, after = (
+            np.logical_or.reduce(
+                [bodies[(phase + way * step) % count] == value for step in range(1, reach + 1)]
+            )
+            for way in (-1, 1)
+        )
+        held[before & after] = value
+    return held
 
 
 def ventricle_tip(value: Float32, pixel_mm: float) -> int:
@@ -84,7 +126,9 @@ def ventricle_tip(value: Float32, pixel_mm: float) -> int:
     return 0
 
 
-def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = None) -> Float32:
+def clean_probability(
+    probability: Float32, pixel_mm: float, tip: int | None = None, held: Label | None = None
+) -> Float32:
     """Take probability from structures where anatomy rules them out.
 
     The heart is one body and so is each of its structures; what lies enclosed by the heart in a
@@ -102,6 +146,9 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
     tip
         First plane that can hold the left ventricle (`ventricle_tip`); by default found from this
         phase alone.
+    held
+        ``(plane, row, column)`` where structures lie before and after this phase: pieces of theirs
+        that lie there are no islands.
 
     Returns
     -------
@@ -116,23 +163,25 @@ def clean_probability(probability: Float32, pixel_mm: float, tip: int | None = N
         tip = ventricle_tip(probability[None], pixel_mm)
     cleaned = probability.copy()
     part = cleaned[:, :, box[1], box[2]]
+    held = np.zeros_like(labels) if held is None else held
+    held = held[:, box[1], box[2]]
     join_auricle(part)
     part_from_right_heart(part, pixel_mm)
     labels = most_probable(part)
     enclosed = _enclosed(labels == 0)
     whole = (labels > 0) | enclosed
     # Beside the body what is less probable than the background stays: it tells where borders lie.
-    part[:, 1:] *= ~(whole & ~_largest_body(whole))[:, None]
+    part[:, 1:] *= ~(whole & ~_largest_body(whole, held > 0))[:, None]
     part[:, 0] *= ~enclosed
     _hold_cavity(part, pixel_mm)
     # Before islands are taken away: a papillary muscle is one, and its place is the cavity's.
     _smooth_cavity(part, pixel_mm)
     _bridge_cavity(part)
-    _keep_bodies(part)
+    _keep_bodies(part, held)
     _keep_ringed(part)
     _close_apex(part, tip, pixel_mm)
     # What took over where something was ruled out may be an island itself.
-    _keep_bodies(part)
+    _keep_bodies(part, held)
     _close_ring(part, pixel_mm)
     total = part.sum(axis=1, keepdims=True)
     # All classes ruled out: background is what is left.
@@ -149,8 +198,11 @@ def _bounding_box(labels: Label) -> tuple[slice, slice, slice] | None:
     return planes, rows, columns
 
 
-def _largest_body(mask: Mask) -> Mask:
-    """The largest part and all that lies within `NECK` of it; the mask itself when empty."""
+def _largest_body(mask: Mask, held: Mask | None = None) -> Mask:
+    """The largest part and all that lies within `NECK` of it; the mask itself when empty.
+
+    Parts that lie where ``held`` tells stay, too.
+    """
     found = ndimage.find_objects(mask.view(np.uint8))
     if not found:
         return mask
@@ -165,17 +217,21 @@ def _largest_body(mask: Mask) -> Mask:
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     largest = np.zeros_like(mask)
-    largest[found[0]] = parts == sizes.argmax()
+    kept = np.flatnonzero(sizes == sizes.max())[:1]
+    if held is not None and held.any():
+        shares = np.bincount(parts[held[found[0]]], minlength=len(sizes)) / np.maximum(sizes, 1)
+        kept = np.append(kept, 1 + np.flatnonzero(shares[1:] >= HELD_SHARE))
+    largest[found[0]] = np.isin(parts, kept)
     return largest
 
 
-def _keep_bodies(part: Float32) -> None:
+def _keep_bodies(part: Float32, held: Label) -> None:
     """Take every structure's probability outside its largest body, in place."""
     labels, unsettled = most_probable(part), set(LABELS.values())
     while unsettled:
         unsettled.remove(value := min(unsettled))
         mask = labels == value
-        beside = mask & ~_largest_body(mask)
+        beside = mask & ~_largest_body(mask, held == value)
         if beside.any():
             part[:, value] *= ~beside
             labels[beside] = part.transpose(0, 2, 3, 1)[beside].argmax(axis=-1)

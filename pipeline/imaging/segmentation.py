@@ -124,7 +124,8 @@ def segment_cine(
     settle_tricuspid(found.value)
     share = settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2)
     blend_phases(found.value, share, cine.phases)
-    clean_cycle(found.value, found.view.pixel_mm)
+    step_mm = found.view.slice_step_mm / found.planes_a_slice
+    clean_cycle(found.value, found.view.pixel_mm, step_mm)
     end_at_dark_line(found, cine)
     drawn = _drawn(found)
     _require_ventricle(drawn, found.view, settings)
