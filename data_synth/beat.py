@@ -330,16 +330,23 @@ def radial_loss(shape: Shape, pulse: Pulse) -> float:
     muscle cannot make up for it.
     """
     full = _beat(shape, pulse, Amounts(0.0, 0.0, 0.0, 0.0), 1.0, 0.0, 0.0)
-    turns = 1 if is_round(shape) and not pulse.infarct_strength else 48
+    plain = is_round(shape)
+    turns = 1 if plain and not pulse.infarct_strength else 48
+    angles = np.arange(turns) * 2 * math.pi / turns
+    missing = [infarct_around(angle, full) for angle in angles]
     before = gain = loss = 0.0
     for z in np.linspace(-shape.lv_length, 0, 400):
         squared, closing = endocardium(z, shape)[0], contracting(z, shape)
-        for angle in np.arange(turns) * 2 * math.pi / turns:
-            around = infarct_around(angle, full)
-            stretch = muscle_stretch(z, around, shape, full)
-            uneven = unevenness(z, angle, shape)[0] ** 2
+        healthy = muscle_stretch(z, 0.0, shape, full), muscle_slope(z, 0.0, shape, full), 0.0
+        for angle, around in zip(angles, missing, strict=True):
+            stretch, slope, still = healthy
+            if around > 0:
+                stretch = muscle_stretch(z, around, shape, full)
+                slope = muscle_slope(z, around, shape, full)
+                still = infarct_share(z, angle, shape, full)
+            uneven = 1.0 if plain else unevenness(z, angle, shape)[0] ** 2
             before += squared * uneven
-            gain += squared * uneven * muscle_slope(z, around, shape, full) * stretch
-            loss += closing * uneven * (1 - infarct_share(z, angle, shape, full)) * stretch
+            gain += squared * uneven * slope * stretch
+            loss += closing * uneven * (1 - still) * stretch
     most = LARGEST_LOSS / (1 - pulse.descent_lv / shape.lv_length)
     return min((gain - (1 - pulse.lv_ejection) * before) / loss, most)
