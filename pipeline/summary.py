@@ -162,9 +162,36 @@ def cut_sideways_by(cut: dict[str, int], ingest: dict[str, Any]) -> list[str]:
 
 def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
     """Sentences on what speaks against labels or times, of the figures of two stages."""
-    of_labels = *low_confidence(segment), *muscle_changes(segment)
-    of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface), *crossings(surface)
-    return [*of_labels, *of_surfaces]
+    of_labels = *low_confidence(segment), *astray(segment), *muscle_changes(segment)
+    of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface)
+    return [*of_labels, *of_surfaces, *lost_pieces(surface), *crossings(surface)]
+
+
+def astray(segment: dict[str, Any]) -> list[str]:
+    """A sentence where slices lay farther aside than another usual breath-hold takes them.
+
+    >>> astray({"astray_mm": {"5": 19.4}})
+    ['slice 5 showed the heart 19 mm beside where the others show it, and was moved back: held in \
+another breath?']
+    """
+    return [
+        f"slice {number} showed the heart {aside_mm:.0f} mm beside where the others show it, and "
+        "was moved back: held in another breath?"
+        for number, aside_mm in segment.get("astray_mm", {}).items()
+    ]
+
+
+def lost_pieces(surface: dict[str, Any]) -> list[str]:
+    """A sentence for each surface that leaves out a good part of its labels, which lies apart.
+
+    >>> lost_pieces({"left_out_ml": {"rv_endocardium": {"4": 9.1}}})
+    ['surfaces: rv_endocardium leaves out 9.1 ml of its labels in phase 4, which lie apart']
+    """
+    return [
+        f"surfaces: {name} leaves out {max(by_phase.values()):.1f} ml of its labels in phase "
+        f"{', '.join(map(str, by_phase))}, which lie apart"
+        for name, by_phase in surface.get("left_out_ml", {}).items()
+    ]
 
 
 def crossings(surface: dict[str, Any]) -> list[str]:

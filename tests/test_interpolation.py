@@ -294,6 +294,34 @@ def test_slices_unevenly_spaced_are_told_what_their_shifts_make_of_a_curved_axis
     assert not moved.precision[:, :, 2].any()
 
 
+@pytest.mark.parametrize("aside_mm", [9.0, 14.0, 20.0])
+@pytest.mark.parametrize("number", [2, 5, 7])
+def test_a_slice_far_aside_is_brought_back_and_the_others_stay(number, aside_mm):
+    """A breath-hold beyond all usual ones, in any direction: what is left is a usual one's."""
+    heights_mm, axes = 10.0 * np.arange(10), np.eye(3)[[0, 2, 1]]
+    usual_mm = np.random.default_rng(9).normal(0, (0.5, 1.0), (10, 2))
+    still = slice_shifts_mm(tilted_heart(usual_mm), PIXEL_MM, heights_mm, axes)[:, :2]
+    for angle in np.deg2rad([20, 110, 250]):
+        far_mm = np.zeros((10, 2))
+        far_mm[number] = aside_mm * np.array([np.cos(angle), np.sin(angle)])
+        found = slice_shifts_mm(tilted_heart(usual_mm + far_mm), PIXEL_MM, heights_mm, axes)
+        left_mm = np.linalg.norm(found[:, :2] - still - far_mm, axis=1)
+        assert left_mm[number] < 2.2
+        assert np.delete(left_mm, number).max() < 1.0
+
+
+def test_the_rim_of_a_valves_opening_moves_no_slice():
+    """The last cut is a sixth of the one before it, 12 mm beside the axis, in every phase."""
+    x, y = in_plane_mm()
+    labels = tilted_heart(np.zeros((10, 2)))
+    places = np.array([[2.0 * k - 10, 5 - 1.0 * k] for k in range(10)])
+    rim = np.hypot(x - places[9, 0] - 12, y - places[9, 1]) < 11
+    labels[:, 9] = np.where(rim, 2, 0)
+    labels[:, 9][:, np.hypot(x - places[9, 0] - 12, y - places[9, 1]) < 7.5] = 1
+    found = slice_shifts_mm(labels, PIXEL_MM, 10.0 * np.arange(10), np.eye(3)[[0, 2, 1]])
+    assert np.abs(found).max() < 0.2 * PIXEL_MM
+
+
 def test_breath_hold_jumps_are_found_and_tilt_is_left_alone():
     axes = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
     rng = np.random.default_rng(5)

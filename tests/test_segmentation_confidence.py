@@ -19,6 +19,7 @@ from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import (
+    _astray_mm,
     _require_cavity,
     _require_right_ventricle,
     missed_hearts,
@@ -408,3 +409,9 @@ def test_a_dark_lung_at_the_images_side_is_no_edge():
     labels = np.zeros((8, 3, 64, 64), np.uint8)
     labels[:, 1, np.hypot(row - 32, column - 28) < 8] = LABELS["rv_cavity"]
     assert cut_sideways(labels, intensity) == {}
+
+
+def test_slices_far_aside_are_named_by_the_cines_own_numbers():
+    """The apex is the stack's last slice; what lies along the normal is not aside."""
+    shifts_mm = np.array([[0.5, -0.5, 0], [-9.0, 12.0, 0], [5, -5, 20]])
+    assert _astray_mm(shifts_mm, np.array([7, 4, 2])) == {4: 15.0}

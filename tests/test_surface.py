@@ -155,7 +155,7 @@ def test_a_slit_between_two_parts_is_plugged_for_the_mesh_too() -> None:
         slabs = [slab(turned, (side * 10, 0, 0), (8, 18, 14)) for side in (-1, 1)]
         bars = [slab(turned, (0, side * 14, 0), (10, 4, 10)) for side in (-1, 1)]
         parts = [
-            Body((LevelSet(part.astype(np.float32), SPACING_MM),), (0.0,), np.zeros(3, int))
+            Body((LevelSet(part.astype(np.float32), SPACING_MM),), (0.0,), (0.0,), np.zeros(3, int))
             for part in (slabs[0], np.minimum.reduce([slabs[1], *bars]))
         ]
         level = joined(parts, np.zeros(1), SurfaceSettings(), map).levels[0]

@@ -36,11 +36,20 @@ OUTLIER = 2.0
 """A bend this many deviations large counts half: at the base a slice cuts through part of a wall
 and the centre of what is left jumps, shift or no shift."""
 
-ROUNDS = 8
-"""Of reweighting; the weights have settled well before."""
+ASTRAY_MM = 8.0
+"""A slice moved in its plane by more was held in no usual breath: over three standard deviations
+of `BREATH_MM` along head and feet."""
 
-LEAST_AREA_MM2 = 150.0
-"""A smaller cut through a structure says little of where the slice lies."""
+ROUNDS = 8
+"""Of reweighting; more change little."""
+
+FIRST_HOLD = 0.05
+"""Weight of what is known of breath-holds in the first round: a slice far aside is seen as such
+only where nothing holds it, and held at first it would be its neighbours that look bent."""
+
+LEAST_AREA_MM2, LEAST_SHARE = 150.0, 0.3
+"""A smaller cut through a structure, or one of a smaller share of a neighbouring slice's, says
+little of where the slice lies: it is the rim of a valve's opening or the roof of an atrium."""
 
 
 VIEW_MM = 6.0
@@ -66,9 +75,11 @@ def slice_shifts_mm(
 
     The shifts are the most probable ones given normal curvature of the anatomy, normal shifts
     between breath-holds and, where there are long-axis views, how far each slice lies from each
-    view: linear least squares, outliers weighted down (Cauchy's weights). Every view has a shift
-    of its own. Along its normal a slice is moved where a view cuts it; elsewhere the shift is too
-    uncertain to tell, and it is left but for what keeps it apart from its neighbours.
+    view: linear least squares, outliers weighted down (Cauchy's weights). So is what is known of
+    breath-holds, beyond its usual range: one slice far aside is brought back to the others, which
+    stay. Every view has a shift of its own. Along its normal a slice is moved where a view cuts it;
+    elsewhere the shift is too uncertain to tell, and it is left but for what keeps it apart from
+    its neighbours.
     Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
@@ -151,16 +162,20 @@ def _solved(known: _Equations, of_a_slice: Float, slices: int) -> tuple[Float, F
     """Shifts ``(slice, 3)``, and how many deviations each equation is off, ``(n,)``."""
     count = known.matrix.shape[1]
     prior = np.kron(np.eye(count), np.eye(3) / VIEW_MM**2)
-    prior[: 3 * slices, : 3 * slices] = np.kron(np.eye(slices), of_a_slice)
-    shifts_mm = np.zeros((count, 3))
+    shifts_mm, left = np.zeros((count, 3)), np.zeros(len(known.matrix))
+    held = np.full(slices, FIRST_HOLD)
     for _ in range(ROUNDS):
-        left_mm = known.offsets_mm - known.matrix @ shifts_mm
-        left = np.sqrt(np.einsum("ni,nij,nj->n", left_mm, known.precision, left_mm))
+        prior[: 3 * slices, : 3 * slices] = np.kron(np.diag(held), of_a_slice)
         weight = known.precision / (1 + (left / OUTLIER) ** 2)[:, None, None]
         normal = np.einsum("na,nij,nb->aibj", known.matrix, weight, known.matrix, optimize=True)
         right = np.einsum("na,nij,nj->ai", known.matrix, weight, known.offsets_mm)
         both = normal.reshape(3 * count, 3 * count) + prior
         shifts_mm = np.linalg.solve(both, right.ravel()).reshape(count, 3)
+        left_mm = known.offsets_mm - known.matrix @ shifts_mm
+        left = np.sqrt(np.einsum("ni,nij,nj->n", left_mm, known.precision, left_mm))
+        # Cauchy's distribution in three directions, and no more than a normal one near its middle.
+        usual = np.einsum("si,ij,sj->s", shifts_mm[:slices], of_a_slice, shifts_mm[:slices])
+        held = np.minimum(4 / (1 + usual), 1)
     return shifts_mm[:slices], left
 
 
@@ -200,7 +215,9 @@ def _centres_mm(mask: Mask, pixel_mm: float) -> Float:
     rows, columns = (np.arange(side) * pixel_mm for side in mask.shape[2:])
     over_columns, over_rows = mask.sum(axis=2), mask.sum(axis=3)
     area = over_rows.sum(axis=2).astype(float)
-    area[area * pixel_mm**2 < LEAST_AREA_MM2] = np.nan
+    beside = np.pad(area, ((0, 0), (1, 1)))
+    most = np.maximum(beside[:, :-2], beside[:, 2:])
+    area[(area * pixel_mm**2 < LEAST_AREA_MM2) | (area < LEAST_SHARE * most)] = np.nan
     return np.stack([over_columns @ columns / area, over_rows @ rows / area], axis=-1)
 
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label, Mask
-from pipeline.imaging.alignment import slice_shifts_mm
+from pipeline.imaging.alignment import ASTRAY_MM, slice_shifts_mm
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
@@ -27,7 +27,7 @@ from pipeline.imaging.inference import (
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import locate_heart
-from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
+from pipeline.imaging.long_axis import NO_CROSSINGS, find_crossings
 from pipeline.imaging.lookalikes import (
     clear_apex,
     favour_left_atrium,
@@ -83,6 +83,9 @@ class Segmentation:
     confidence: Float
     """``(phase, z)`` in [0, 1] (`pipeline.imaging.confidence.slice_confidence`)."""
 
+    astray_mm: dict[int, float]
+    """Slices whose heart lay farther aside than another usual breath-hold takes it, and how far."""
+
     orientation: Orientation
     """How the heart was found to lie, against what the file says. All products are in the file's
     frame, whichever it is."""
@@ -136,11 +139,32 @@ def segment_cine(
     labels = _on_cine(found, cine)
     if bring_to_one_axis(found, cine):
         drawn = _drawn(found)
-    heart, heart_mr_from_index = _isotropic(found, drawn, settings, crossings, acquired)
+    shifts_mm = np.zeros((len(acquired), 3))
+    if settings.correct_shifts:
+        heights_mm = found.view.slice_step_mm * np.asarray(acquired, float)
+        shifts_mm = slice_shifts_mm(
+            drawn[:, acquired], found.view.pixel_mm, heights_mm, found.view.axes, crossings
+        )
+    heart, heart_mr_from_index = _isotropic(found, settings, shifts_mm, acquired)
     stored = np.argsort(found.view.order)
     return Segmentation(
-        labels, heart, heart_mr_from_index, confidence[:, stored], place.orientation
+        labels,
+        heart,
+        heart_mr_from_index,
+        confidence[:, stored],
+        _astray_mm(shifts_mm, np.asarray(found.view.order)[acquired]),
+        place.orientation,
     )
+
+
+def _astray_mm(shifts_mm: Float, numbers: Integer) -> dict[int, float]:
+    """Slices moved by more than `ASTRAY_MM` in their plane, by number, and by how much."""
+    aside_mm = np.hypot(shifts_mm[:, 0], shifts_mm[:, 1])
+    return {
+        int(number): round(float(mm), 1)
+        for number, mm in sorted(zip(numbers, aside_mm, strict=True))
+        if mm > ASTRAY_MM
+    }
 
 
 def _require_contrast(cine: Cine) -> None:
@@ -302,22 +326,15 @@ def _require_right_ventricle(drawn: Label) -> None:
 
 
 def _isotropic(
-    found: PlaneProbability,
-    drawn: Label,
-    settings: SegmentSettings,
-    crossings: Crossings,
-    acquired: Integer,
+    found: PlaneProbability, settings: SegmentSettings, shifts_mm: Float, acquired: Integer
 ) -> tuple[Label, Float]:
     """The heart on an isotropic grid along the view's axes, and that grid's place.
 
-    ``acquired`` are the slices, counted from the apex, that hold more than their neighbours' mean.
+    ``acquired`` are the slices, counted from the apex, that hold more than their neighbours' mean;
+    ``shifts_mm`` ``(slice, 3)`` is taken from them.
     """
     view = found.view
     heights_mm = view.slice_step_mm * np.asarray(acquired, float)
-    shifts_mm = np.zeros((len(acquired), 3))
-    if settings.correct_shifts:
-        seen = drawn[:, acquired]
-        shifts_mm = slice_shifts_mm(seen, view.pixel_mm, heights_mm, view.axes, crossings)
     count = found.planes_a_slice
     planes = (count * acquired[:, None] + np.arange(count)).ravel()
     # Planes between two slices stay in line with both.

@@ -36,6 +36,7 @@ def run(job: Job) -> dict[str, Any]:
         "least_certain": {"phase": int(lowest[0]), "slice": int(lowest[1])},
         "cut_off": cut_off(found.labels),
         "cut_sideways": cut_sideways(found.labels, cine.intensity),
+        "astray_mm": found.astray_mm,
         "orientation": str(found.orientation),
         "mirror_image": found.orientation.is_mirror_image,
         "volumes_ml": volumes,

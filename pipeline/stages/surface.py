@@ -31,6 +31,7 @@ def run(job: Job) -> dict[str, Any]:
         "triangles": {name: len(moving.triangles) for name, moving in found.surfaces.items()},
         "mended_phases": found.mended_phases,
         "crossing_triangles": found.crossing_triangles,
+        "left_out_ml": found.left_out_ml,
         "left_out": found.left_out,
     }
 

@@ -45,6 +45,9 @@ class Body:
     volumes_mm3: tuple[float, ...]
     """Volume by the labels, one a phase."""
 
+    left_out_mm3: tuple[float, ...]
+    """Volume of the labels that lie apart from the solid, one a phase."""
+
     first_index: Integer
     """Index ``(x, y, z)`` of the first voxel in the grid; negative where the body is padded."""
 
@@ -74,6 +77,10 @@ def cut_out(
     return Body(
         tuple(smooth(mask) for mask in masks),
         tuple(float(np.count_nonzero(mask)) * spacing_mm**3 for mask in masks),
+        tuple(
+            float(np.count_nonzero(drawn & ~mask)) * spacing_mm**3
+            for drawn, mask in zip(padded, masks, strict=True)
+        ),
         (low - OF_USE_VOXELS)[::-1],
     )
 
@@ -106,7 +113,8 @@ def joined(
         return _without_tunnels(LevelSet(solid, spacing_mm), settings.edge_mm)
 
     levels = tuple(across(mended, range(len(unions))))
-    return Body(levels, tuple(enclosed_mm3(level) for level in levels), first)
+    volumes_mm3 = tuple(enclosed_mm3(level) for level in levels)
+    return Body(levels, volumes_mm3, (0.0,) * len(levels), first)
 
 
 def _without_tunnels(level: LevelSet, edge_mm: float) -> LevelSet:

@@ -79,6 +79,10 @@ class Extraction:
     crossing_triangles: dict[str, int]
     """How many triangles of each, over all phases, still pass through others; 0 as it should be."""
 
+    left_out_ml: dict[str, dict[int, float]]
+    """What of its labels a surface leaves out, by phase: pieces that lie apart from the rest, where
+    they hold more than ``VOLUME_TOLERANCE`` of it."""
+
     left_out: dict[str, str]
     """Structures that have no surface, and why."""
 
@@ -165,6 +169,7 @@ def extract(
         surfaces,
         {name: one.mended_phases for name, one in followed.items()},
         {name: one.crossing_triangles for name, one in followed.items()},
+        {name: pieces for name, one in followed.items() if (pieces := _pieces_ml(one.body))},
         absent | {name: str(one) for name, one in lost.items()},
     )
 
@@ -315,6 +320,16 @@ def _finished(
     moving = MovingSurface(np.stack(places), triangles, phases)
     _require_volumes(moving, body.volumes_mm3)
     return _Followed(body, moving, sum(mended), sum(left))
+
+
+def _pieces_ml(body: Body) -> dict[int, float]:
+    """Phases in which much of a body's labels lies apart from the rest, and how much, ml."""
+    each = zip(body.volumes_mm3, body.left_out_mm3, strict=True)
+    return {
+        k: round(apart_mm3 / 1000, 1)
+        for k, (kept_mm3, apart_mm3) in enumerate(each)
+        if apart_mm3 > VOLUME_TOLERANCE * (kept_mm3 + apart_mm3)
+    }
 
 
 def _require_volumes(moving: MovingSurface, volumes_mm3: Sequence[float]) -> None:
