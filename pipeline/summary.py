@@ -172,11 +172,11 @@ def astray(segment: dict[str, Any]) -> list[str]:
 
     >>> astray({"astray_mm": {"5": 19.4}})
     ['slice 5 showed the heart 19 mm beside where the others show it, and was moved back: held in \
-another breath?']
+another breath, or labelled wrongly?']
     """
     return [
         f"slice {number} showed the heart {aside_mm:.0f} mm beside where the others show it, and "
-        "was moved back: held in another breath?"
+        "was moved back: held in another breath, or labelled wrongly?"
         for number, aside_mm in segment.get("astray_mm", {}).items()
     ]
 
@@ -185,11 +185,11 @@ def lost_pieces(surface: dict[str, Any]) -> list[str]:
     """A sentence for each surface that leaves out a good part of its labels, which lies apart.
 
     >>> lost_pieces({"left_out_ml": {"rv_endocardium": {"4": 9.1}}})
-    ['surfaces: rv_endocardium leaves out 9.1 ml of its labels in phase 4, which lie apart']
+    ['surfaces: rv_endocardium leaves out up to 9.1 ml of its labels, which lie apart, in phase 4']
     """
     return [
-        f"surfaces: {name} leaves out {max(by_phase.values()):.1f} ml of its labels in phase "
-        f"{', '.join(map(str, by_phase))}, which lie apart"
+        f"surfaces: {name} leaves out up to {max(by_phase.values()):.1f} ml of its labels, which "
+        f"lie apart, in phase {', '.join(map(str, by_phase))}"
         for name, by_phase in surface.get("left_out_ml", {}).items()
     ]
 

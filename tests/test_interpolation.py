@@ -310,6 +310,20 @@ def test_a_slice_far_aside_is_brought_back_and_the_others_stay(number, aside_mm)
         assert np.delete(left_mm, number).max() < 1.0
 
 
+@pytest.mark.parametrize("angle_degrees", [0, 90, 200])
+@pytest.mark.parametrize("last", [7, 9])
+def test_half_of_a_cut_through_a_valve_is_no_breath_hold(last, angle_degrees):
+    """The ventricle's last cut is halved, with or without atria beyond: no slice is far aside."""
+    x, y = in_plane_mm()
+    labels = tilted_heart(np.zeros((10, 2)))
+    angle = np.deg2rad(angle_degrees)
+    way = np.cos(angle) * (x - 2.0 * last + 10) + np.sin(angle) * (y + 1.0 * last - 5)
+    labels[:, last] *= way < 0
+    labels[:, last + 1 :][labels[:, last + 1 :] > 0] = LABELS["left_atrium"]
+    found = slice_shifts_mm(labels, PIXEL_MM, 10.0 * np.arange(10), np.eye(3)[[0, 2, 1]])
+    assert np.abs(found[:, :2]).max() < 5
+
+
 def test_the_rim_of_a_valves_opening_moves_no_slice():
     """The last cut is a sixth of the one before it, 12 mm beside the axis, in every phase."""
     x, y = in_plane_mm()

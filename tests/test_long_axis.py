@@ -463,19 +463,22 @@ def test_a_shift_seen_in_the_plane_tells_of_the_one_along_the_normal() -> None:
     assert np.diff(near_mm - moved_mm).min() == pytest.approx(2.5, abs=1e-5)
 
 
-def test_slices_that_would_change_places_move_as_little_as_keeps_them_apart() -> None:
+@pytest.mark.parametrize("weights", [np.ones(20), np.linspace(0.1, 1, 20)], ids=["alike", "not"])
+def test_slices_that_would_change_places_move_as_little_as_keeps_them_apart(weights) -> None:
     heights_mm = 5.0 * np.arange(20)
     given_mm = np.random.default_rng(9).normal(0, 4, 20)
 
     def off_mm(gaps_mm: Any) -> Any:
         """How far places with these gaps lie from those given, where their mean is best."""
         away_mm = np.concatenate([[0], np.cumsum(gaps_mm)]) - (heights_mm - given_mm)
-        return away_mm - away_mm.mean()
+        return away_mm - np.average(away_mm, weights=weights)
 
     # The least squares that such places leave, by a general solver.
     start = np.full(19, 5.0)
-    best = minimize(lambda gaps: np.square(off_mm(gaps)).sum(), start, bounds=[(2.5, None)] * 19)
+    best = minimize(
+        lambda gaps: (weights * np.square(off_mm(gaps))).sum(), start, bounds=[(2.5, None)] * 19
+    )
     assert best.success
     assert best.fun > 10
-    left_mm = _in_order(heights_mm, given_mm) - given_mm
+    left_mm = _in_order(heights_mm, given_mm, weights) - given_mm
     np.testing.assert_allclose(left_mm, -off_mm(best.x), atol=1e-2)

@@ -16,7 +16,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Float, Label, MovingSurface, transform_points
 from pipeline.imaging.labels import LABELS
-from pipeline.surface.bodies import Body, joined
+from pipeline.surface.bodies import Body, _without_tunnels, joined
 from pipeline.surface.extraction import STRUCTURES, extract
 from pipeline.surface.level_set import LevelSet
 from pipeline.surface.measures import volumes_ml
@@ -161,6 +161,7 @@ def test_a_slit_between_two_parts_is_plugged_for_the_mesh_too() -> None:
         level = joined(parts, np.zeros(1), SurfaceSettings(), map).levels[0]
         surface = extract_surface(level, 2.0)
         assert len(surface.vertices_mm) - len(surface.triangles) / 2 == 2
+        assert _without_tunnels(level, 2.0) is level
         # Nothing is added beyond the slabs.
         hull_mm = slab(turned, (0, 0, 0), (18, 18, 14))
         assert (hull_mm[level.distance_mm < 0] < SPACING_MM).all()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from pipeline.geometry import Float, Label, Mask
+from pipeline.geometry import Float, Integer, Label, Mask
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.long_axis import LEAST_STEP_MM, NO_CROSSINGS, Crossings
 
@@ -41,11 +41,11 @@ ASTRAY_MM = 8.0
 of `BREATH_MM` along head and feet."""
 
 ROUNDS = 8
-"""Of reweighting; more change little."""
+"""Of reweighting; more change little but where one chord alone tells of a slice."""
 
-FIRST_HOLD = 0.05
-"""Weight of what is known of breath-holds in the first round: a slice far aside is seen as such
-only where nothing holds it, and held at first it would be its neighbours that look bent."""
+FIRST_HOLDS = (1.0, 0.05)
+"""Weights of what is known of breath-holds in the first round of two tries: slices held in their
+places, and nearly free of them."""
 
 LEAST_AREA_MM2, LEAST_SHARE = 150.0, 0.3
 """A smaller cut through a structure, or one of a smaller share of a neighbouring slice's, says
@@ -76,10 +76,10 @@ def slice_shifts_mm(
     The shifts are the most probable ones given normal curvature of the anatomy, normal shifts
     between breath-holds and, where there are long-axis views, how far each slice lies from each
     view: linear least squares, outliers weighted down (Cauchy's weights). So is what is known of
-    breath-holds, beyond its usual range: one slice far aside is brought back to the others, which
-    stay. Every view has a shift of its own. Along its normal a slice is moved where a view cuts it;
-    elsewhere the shift is too uncertain to tell, and it is left but for what keeps it apart from
-    its neighbours.
+    breath-holds, beyond its usual range and where more than one chord or view tells: one slice far
+    aside is brought back to the others, which stay. Every view has a shift of its own.
+    Along its normal a slice is moved where a view cuts it; elsewhere the shift is too uncertain to
+    tell, and it is left but for what keeps it apart from its neighbours.
     Slices nearer to one another than `LEAST_STEP_MM` are of one volume: none is moved.
 
     Parameters
@@ -113,17 +113,28 @@ def slice_shifts_mm(
         doubted = _doubted_view(crossings, left[len(bends.offsets_mm) :])
         if doubted is None:
             cut = np.isin(np.arange(len(heights_mm)), crossings.slices)
-            shifts_mm[:, 2] = _in_order(heights_mm, np.where(cut, shifts_mm[:, 2], 0))
+            # A slice far aside gives way to the others.
+            _, weights = _usual(shifts_mm, of_a_slice)
+            shifts_mm[:, 2] = _in_order(heights_mm, np.where(cut, shifts_mm[:, 2], 0), weights)
             # Products by BLAS differ in their last digits with the number of processors.
             return np.round(shifts_mm, 6)
         crossings = crossings.without(doubted)
 
 
-def _in_order(heights_mm: Float, normal_mm: Float) -> Float:
+def _in_order(heights_mm: Float, normal_mm: Float, weights: Float) -> Float:
     """The shifts ``(slice,)`` nearest to those given that keep `LEAST_GAP` between neighbours."""
     least_mm = np.concatenate([[0], np.cumsum(LEAST_GAP * np.diff(heights_mm))])
-    above_mm = isotonic_regression(heights_mm - normal_mm - least_mm).x
+    above_mm = isotonic_regression(heights_mm - normal_mm - least_mm, weights=weights).x
     return np.asarray(heights_mm - least_mm - above_mm)
+
+
+def _usual(shifts_mm: Float, of_a_slice: Float) -> tuple[Float, Float]:
+    """Squared deviations of shifts ``(slice, 3)`` from usual breath-holds, and what they count.
+
+    Cauchy's distribution in three directions, and no more than a normal one near its middle.
+    """
+    squared = np.einsum("si,ij,sj->s", shifts_mm, of_a_slice, shifts_mm)
+    return squared, np.minimum(4 / (1 + squared), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +170,26 @@ def _equations(crossings: Crossings, slices: int) -> _Equations:
 
 
 def _solved(known: _Equations, of_a_slice: Float, slices: int) -> tuple[Float, Float]:
-    """Shifts ``(slice, 3)``, and how many deviations each equation is off, ``(n,)``."""
+    """Shifts ``(slice, 3)``, and how many deviations each equation is off, ``(n,)``.
+
+    Of what two starts come to, slices held in their places and free of them, the more probable.
+    """
+    settled = [_settled(known, of_a_slice, slices, first) for first in FIRST_HOLDS]
+    _, shifts_mm, left = min(settled, key=lambda one: one[0])
+    return shifts_mm, left
+
+
+def _settled(
+    known: _Equations, of_a_slice: Float, slices: int, first: float
+) -> tuple[float, Float, Float]:
+    """How improbable, shifts and deviations that reweighting from one start comes to."""
     count = known.matrix.shape[1]
     prior = np.kron(np.eye(count), np.eye(3) / VIEW_MM**2)
     shifts_mm, left = np.zeros((count, 3)), np.zeros(len(known.matrix))
-    held = np.full(slices, FIRST_HOLD)
+    usual = np.zeros(slices)
+    # One chord alone may be bent by any of its three slices.
+    told = _chords_of_each(known, slices) > 1
+    held = np.where(told, first, 1.0)
     for _ in range(ROUNDS):
         prior[: 3 * slices, : 3 * slices] = np.kron(np.diag(held), of_a_slice)
         weight = known.precision / (1 + (left / OUTLIER) ** 2)[:, None, None]
@@ -173,10 +199,20 @@ def _solved(known: _Equations, of_a_slice: Float, slices: int) -> tuple[Float, F
         shifts_mm = np.linalg.solve(both, right.ravel()).reshape(count, 3)
         left_mm = known.offsets_mm - known.matrix @ shifts_mm
         left = np.sqrt(np.einsum("ni,nij,nj->n", left_mm, known.precision, left_mm))
-        # Cauchy's distribution in three directions, and no more than a normal one near its middle.
-        usual = np.einsum("si,ij,sj->s", shifts_mm[:slices], of_a_slice, shifts_mm[:slices])
-        held = np.minimum(4 / (1 + usual), 1)
-    return shifts_mm[:slices], left
+        usual, counts = _usual(shifts_mm[:slices], of_a_slice)
+        held = np.where(told, counts, 1.0)
+    # Minus the logarithms whose slopes are the weights above.
+    of_slices = np.where(~told | (usual < 3), usual / 2, 1.5 + 2 * np.log((1 + usual) / 4))
+    of_views = np.square(shifts_mm[slices:] / VIEW_MM) / 2
+    of_known = OUTLIER**2 / 2 * np.log1p((left / OUTLIER) ** 2)
+    cost = float(of_slices.sum() + of_views.sum() + of_known.sum())
+    return cost, shifts_mm[:slices], left
+
+
+def _chords_of_each(known: _Equations, slices: int) -> Integer:
+    """How many chords and views ``(slice,)`` tell of each slice."""
+    chords = np.unique(known.matrix, axis=0)[:, :slices]
+    return np.asarray(np.count_nonzero(chords, axis=0))
 
 
 def _doubted_view(crossings: Crossings, left: Float) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import cv2
 import numpy as np
@@ -22,9 +22,9 @@ NECK = (3, 3)
 """Rows and columns of the brush that bridges necks: parts up to two pixels apart are one body."""
 
 HELD_BEATS, HELD_SHARE, HELD_MM3 = 0.12, 0.5, 300.0
-"""A piece beside a structure's body is no island if so much of the beat before it and after it that
-body lies in its place, by this share, and if it is so large: a slice taken far aside, in another
-breath-hold, parts a right ventricle while it is thin."""
+"""Pieces beside a structure's body are no islands if within so much of the beat that body lies in
+their place, by this share, both before and after, and if they are so large together: a slice taken
+far aside, in another breath-hold, parts a right ventricle while it is thin."""
 
 OPEN_SHARE = 0.4
 """A cavity that borders on this share of background is not surrounded by its muscle."""
@@ -103,13 +103,19 @@ def _held(bodies: Sequence[Label], phase: int) -> Label:
     if reach == 0:
         return held
     for value in LABELS.values():
+        # Within so many steps on either side.
         before, after = (
-            np.logical_or.reduce(
-                [bodies[(phase + way * step) % count] == value for step in range(1, reach + 1)]
+            list(
+                accumulate(
+                    (bodies[(phase + way * step) % count] == value for step in range(1, reach + 1)),
+                    np.logical_or,
+                )
             )
             for way in (-1, 1)
         )
-        held[before & after] = value
+        # What falls apart for longer is held in none of its phases.
+        for one, other in zip(before, reversed(after), strict=True):
+            held[one & other] = value
     return held
 
 
