@@ -171,12 +171,12 @@ def astray(segment: dict[str, Any]) -> list[str]:
     """A sentence where slices lay farther aside than another usual breath-hold takes them.
 
     >>> astray({"astray_mm": {"5": 19.4}})
-    ['slice 5 showed the heart 19 mm beside where the others show it, and was moved back: held in \
-another breath, or labelled wrongly?']
+    ['slice 5 showed the heart 19 mm beside where the others show it, and was moved back: it was \
+held in another breath, or labelled wrongly']
     """
     return [
         f"slice {number} showed the heart {aside_mm:.0f} mm beside where the others show it, and "
-        "was moved back: held in another breath, or labelled wrongly?"
+        "was moved back: it was held in another breath, or labelled wrongly"
         for number, aside_mm in segment.get("astray_mm", {}).items()
     ]
 

@@ -135,6 +135,22 @@ def test_a_heart_in_pieces_has_no_outer_surface():
     assert re.search(r"pieces in phase 1 .at 0\.500", found.left_out["heart"])
 
 
+@pytest.mark.parametrize(("apart_mm", "is_told"), [(3.0, False), (9.0, True)])
+def test_what_of_its_labels_a_surface_leaves_out_is_told_with_its_phase(apart_mm, is_told):
+    """A ball beside the right ventricle in phase 1 holds (8/14)^3, a fifth, of its volume."""
+    heart, frame = balls(0.0)
+    points, _ = voxel_centres((54, 30, 30))
+    middle_mm = 18 - 16 - 2 * 14 - apart_mm - 8
+    piece = np.linalg.norm(points - (middle_mm, 0, 0), axis=-1) < 8
+    if not is_told:
+        piece = np.linalg.norm(points - (middle_mm, 0, 0), axis=-1) < 4
+    heart[1][piece] = LABELS["rv_cavity"]
+    found = extract(heart, frame, np.array([0.0, 0.5]), SETTINGS)
+    piece_ml = np.count_nonzero(piece) * SPACING_MM**3 / 1000
+    told = {"rv_endocardium": {1: pytest.approx(piece_ml, abs=0.06)}} if is_told else {}
+    assert found.left_out_ml == told
+
+
 def slab(points: Float, centre_mm: tuple[float, ...], half_mm: tuple[float, ...]) -> Float:
     """Signed distance to a box."""
     beyond = np.abs(points - np.array(centre_mm)) - np.array(half_mm)
