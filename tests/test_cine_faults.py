@@ -19,7 +19,7 @@ from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.dicom_files import told_from_notes
 from pipeline.imaging.faults import (
     doubts_of_gaps,
-    doubts_of_order,
+    doubts_of_range,
     redraw_slices,
     require_different_images,
     require_room_for_a_heart,
@@ -30,6 +30,7 @@ from pipeline.imaging.frames import Frame
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.phases import common_phases, doubts_of_phases
 from pipeline.imaging.stack_choice import choose_stack
+from pipeline.imaging.stored_order import doubts_of_order
 from pipeline.imaging.unrecorded import require_finite, without_unrecorded
 from pipeline.study import open_study
 from tests.outside_heart import Scan, render
@@ -110,6 +111,17 @@ def test_phases_that_are_copies_are_told() -> None:
     assert require_different_images(cine, "here") == (words.format(2), words.format(3))
 
 
+def test_one_image_in_several_phases_of_a_slice_is_told() -> None:
+    cine = noisy()
+    cine.intensity[3] = cine.intensity[0]
+    cine.intensity[[1, 3], 2] = cine.intensity[0, 2]
+    cine.intensity[:, 4] = 0
+    assert require_different_images(cine, "here") == (
+        "phase 3 shows the same images as phase 0 in all slices",
+        "slice 2 shows one image in phases 0 1",
+    )
+
+
 def test_a_heart_that_never_moves_is_refused() -> None:
     """As two files of which one was copied from the other."""
     cine = noisy(phases=2)
@@ -120,6 +132,14 @@ def test_a_heart_that_never_moves_is_refused() -> None:
     cine.intensity[:, 0] = 0
     with pytest.raises(InputError, match="here: all phases show the same images"):
         require_different_images(cine, "here")
+
+
+def test_what_a_window_cut_off_is_told() -> None:
+    cine = noisy(slices=40)
+    assert doubts_of_range(cine) == ()
+    most = float(np.quantile(cine.intensity, 0.9))
+    (told,) = doubts_of_range(replace(cine, intensity=np.minimum(cine.intensity, most)))
+    assert told.startswith("10% of the pixels have the largest of all values")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

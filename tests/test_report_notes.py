@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config import Settings
+from pipeline.doubts import doubts
 from pipeline.geometry import MovingSurface
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.view import AS_THE_FILE_SAYS
@@ -24,7 +25,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, render
 from pipeline.report.registered import frames_shown, registration_notes
 from pipeline.stages.report import _of_whole_ventricles, _opening
-from pipeline.summary import doubts, remarks
+from pipeline.summary import remarks
 
 
 def notes(us: object, figures: dict[str, Any] | None) -> list[str]:

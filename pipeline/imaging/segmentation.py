@@ -17,6 +17,7 @@ from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.cut_off import BODIES
 from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_room_for_a_heart
+from pipeline.imaging.in_step import out_of_step
 from pipeline.imaging.inference import (
     PlaneProbability,
     blend_phases,
@@ -86,6 +87,9 @@ class Segmentation:
     astray_mm: dict[int, float]
     """Slices whose heart lay farther aside than another usual breath-hold takes it, and how far."""
 
+    out_of_step: dict[int, dict[str, float]]
+    """Slices that do not beat with the others (`pipeline.imaging.in_step.out_of_step`)."""
+
     orientation: Orientation
     """How the heart was found to lie, against what the file says. All products are in the file's
     frame, whichever it is."""
@@ -147,12 +151,15 @@ def segment_cine(
         )
     heart, heart_mr_from_index = _isotropic(found, settings, shifts_mm, acquired)
     stored = np.argsort(found.view.order)
+    numbers = np.asarray(found.view.order)[acquired]
+    apart = out_of_step(drawn[:, acquired], cine.phases)
     return Segmentation(
         labels,
         heart,
         heart_mr_from_index,
         confidence[:, stored],
-        _astray_mm(shifts_mm, np.asarray(found.view.order)[acquired]),
+        _astray_mm(shifts_mm, numbers),
+        {int(numbers[place]): apart[place] for place in apart},
         place.orientation,
     )
 

@@ -14,7 +14,7 @@ from pipeline.imaging.dicom import read_dicom_study
 from pipeline.imaging.ecg import Ecg, other_patient, patient_mark, read_ecg
 from pipeline.imaging.faults import (
     doubts_of_gaps,
-    doubts_of_order,
+    doubts_of_range,
     redraw_slices,
     require_different_images,
     require_slices_before_phases,
@@ -23,6 +23,7 @@ from pipeline.imaging.faults import (
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti import read_nifti_cine, read_nifti_views
 from pipeline.imaging.phases import doubts_of_phases
+from pipeline.imaging.stored_order import doubts_of_order
 from pipeline.imaging.unrecorded import require_finite, without_unrecorded
 from pipeline.job import Job
 from pipeline.products import write_cine
@@ -77,6 +78,7 @@ def run(job: Job) -> dict[str, Any]:
             *copies,
             *doubts_of_gaps(cine),
             *doubts_of_order(stack.cine),
+            *doubts_of_range(cine),
             *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, _timed(stack)),
             *_doubts_of_beat(job, stack, ecg),
             *_doubts_of_patient(job, stack, ecg),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline import INTENDED_USE, __version__
+from pipeline.doubts import doubts
 from pipeline.field.fixture import Fixture
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.reader import ForceField
@@ -28,7 +29,6 @@ from pipeline.summary import (
     by_reason,
     cut_off_by,
     cut_sideways_by,
-    doubts,
     of_timing,
     series_left_out,
 )

@@ -37,6 +37,7 @@ def run(job: Job) -> dict[str, Any]:
         "cut_off": cut_off(found.labels),
         "cut_sideways": cut_sideways(found.labels, cine.intensity),
         "astray_mm": found.astray_mm,
+        "out_of_step": found.out_of_step,
         "orientation": str(found.orientation),
         "mirror_image": found.orientation.is_mirror_image,
         "volumes_ml": volumes,

@@ -1,0 +1,190 @@
+"""What speaks against labels, surfaces and their times, in sentences for terminal and report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.imaging.settings import LOW_CONFIDENCE
+
+TOLD_BELOW = 0.7
+"""Confidence at which labels are told beside the report, too: of 40 sound studies 2 had less."""
+
+MUSCLE_RANGE = 1.4
+"""Largest over smallest volume of heart muscle, which hardly changes through a beat, beyond which
+its labels are told to be doubtful: the most was 1.09 in 23 studies of the phantom, and 1.29 in 24
+stacks of a second renderer, noisy or of thick slices; images with inverted contrast gave 1.89."""
+
+MOST_EJECTED = 0.85
+"""Share of its largest volume that a left ventricle ejects at most: of 20 phantoms the
+most was 0.75, and labels of a ventricle that metal had half erased 0.94."""
+
+UNEQUAL_STROKES = 0.15
+"""By what share of the larger one stroke volumes may differ: those found in nine studies of the
+phantom, whose valves are tight, did by 0.08 at most."""
+
+EARLIEST_SYSTOLE, LATEST_SYSTOLE = 0.17, 0.15
+"""Share of the beat by which the left ventricle's end of systole may lie before and after its usual
+place (`pipeline.registration.clock.systole_s`). A pulse reaches the finger a fifth of a beat after
+the R peak or later; phases in reverse lie as far off in slow hearts, in fast ones by less."""
+
+LEAST_EJECTION = 0.15
+"""Of a heart that ejects less than this share, noise decides when it is smallest."""
+
+HARDLY = 0.25
+"""Of the other slices' swing: what a slice has that hardly moves."""
+
+
+def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
+    """Sentences on what speaks against labels or times, of the figures of two stages."""
+    of_slices = *low_confidence(segment), *astray(segment), *out_of_step(segment)
+    of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface)
+    of_labels = *of_slices, *muscle_changes(segment), *odd_ejection(segment)
+    return [*of_labels, *of_surfaces, *lost_pieces(surface), *crossings(surface)]
+
+
+def astray(segment: dict[str, Any]) -> list[str]:
+    """A sentence where slices lay farther aside than another usual breath-hold takes them.
+
+    >>> astray({"astray_mm": {"5": 19.4}})
+    ['slice 5 showed the heart 19 mm beside where the others show it, and was moved back: it was \
+held in another breath, or labelled wrongly']
+    """
+    return [
+        f"slice {number} showed the heart {aside_mm:.0f} mm beside where the others show it, and "
+        "was moved back: it was held in another breath, or labelled wrongly"
+        for number, aside_mm in segment.get("astray_mm", {}).items()
+    ]
+
+
+def out_of_step(segment: dict[str, Any]) -> list[str]:
+    """Sentences on slices that do not beat with the others.
+
+    >>> out_of_step({"out_of_step": {"4": {"swing": -0.9, "late": 0.4}}})
+    ['slice 4 does not beat with the others (as if 0.40 of a beat late): look at its times and \
+order; between sound neighbours cine.spoilt_slices draws it anew']
+    """
+    ways: dict[str, list[str]] = {}
+    for number, found in segment.get("out_of_step", {}).items():
+        ways.setdefault(_way(found), []).append(number)
+    return [
+        f"slice {', '.join(numbers)} does not beat with the others ({how}): look at its times and "
+        "order; between sound neighbours cine.spoilt_slices draws it anew"
+        for how, numbers in ways.items()
+    ]
+
+
+def _way(found: dict[str, float]) -> str:
+    late = found.get("late")
+    if late is not None:
+        return f"as if {abs(late):.2f} of a beat {'late' if late > 0 else 'early'}"
+    if abs(found["swing"]) < HARDLY:
+        return "it hardly moves, as a scar may, or one image for several phases"
+    return (
+        "it moves against them, as a bulging scar may"
+        if found["swing"] < 0
+        else "it moves otherwise"
+    )
+
+
+def lost_pieces(surface: dict[str, Any]) -> list[str]:
+    """A sentence for each surface that leaves out a good part of its labels, which lies apart.
+
+    >>> lost_pieces({"left_out_ml": {"rv_endocardium": {"4": 9.1}}})
+    ['surfaces: rv_endocardium leaves out up to 9.1 ml of its labels, which lie apart, in phase 4']
+    """
+    return [
+        f"surfaces: {name} leaves out up to {max(by_phase.values()):.1f} ml of its labels, which "
+        f"lie apart, in phase {', '.join(map(str, by_phase))}"
+        for name, by_phase in surface.get("left_out_ml", {}).items()
+    ]
+
+
+def crossings(surface: dict[str, Any]) -> list[str]:
+    """A sentence where surfaces pass through themselves.
+
+    >>> crossings({"crossing_triangles": {"epicardium": 0, "heart": 4}})
+    ['surfaces: heart passes through itself (4 triangles over all phases); look before you use it']
+    """
+    counts = surface.get("crossing_triangles", {})
+    return [
+        f"surfaces: {name} passes through itself ({count} triangles over all phases); look before "
+        "you use it"
+        for name, count in counts.items()
+        if count
+    ]
+
+
+def low_confidence(segment: dict[str, Any]) -> list[str]:
+    """A sentence where the least certain labels are far below the others."""
+    lowest = segment.get("lowest_confidence", 1.0)
+    if lowest >= TOLD_BELOW:
+        return []
+    at = segment["least_certain"]
+    return [
+        f"labels of slice {at['slice']} in phase {at['phase']}, whose confidence of "
+        f"{lowest:.2f} is the lowest; the report shows all below {LOW_CONFIDENCE:g}"
+    ]
+
+
+def muscle_changes(segment: dict[str, Any]) -> list[str]:
+    """A sentence where the muscle's volume changes through the beat as muscle does not."""
+    volumes_ml = segment.get("volumes_ml", {}).get("lv_myocardium", [])
+    if not volumes_ml or max(volumes_ml) <= MUSCLE_RANGE * min(volumes_ml):
+        return []
+    least, most = (volumes_ml.index(pick(volumes_ml)) for pick in (min, max))
+    return [
+        f"labels: of heart muscle phase {least} has {volumes_ml[least]:.0f} ml and phase {most} "
+        f"{volumes_ml[most]:.0f} ml, though muscle keeps its volume; look at the contours"
+    ]
+
+
+def odd_ejection(segment: dict[str, Any]) -> list[str]:
+    """A sentence where the left ventricle empties as none does.
+
+    >>> odd_ejection({"volumes_ml": {"lv_cavity": [150.0, 9.0]}})
+    ['labels: the left ventricle ejects 94 % of its 150 ml; look at the contours of phase 1']
+    """
+    volumes_ml = segment.get("volumes_ml", {}).get("lv_cavity", [])
+    if not volumes_ml or min(volumes_ml) >= (1 - MOST_EJECTED) * max(volumes_ml):
+        return []
+    share = 1 - min(volumes_ml) / max(volumes_ml)
+    return [
+        f"labels: the left ventricle ejects {100 * share:.0f} % of its {max(volumes_ml):.0f} ml; "
+        f"look at the contours of phase {volumes_ml.index(min(volumes_ml))}"
+    ]
+
+
+def unequal_strokes(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
+    """A sentence where one ventricle ejects clearly more than the other, which it fills."""
+    volumes_ml = surface.get("volumes_ml", {})
+    both = [volumes_ml.get(name) for name in ("lv_endocardium", "rv_endocardium")]
+    cut = {*segment.get("cut_off", {}), *segment.get("cut_sideways", {})}
+    if not all(both) or cut & {"left ventricle", "right ventricle"}:
+        return []
+    left_ml, right_ml = (max(one) - min(one) for one in both)
+    if abs(left_ml - right_ml) <= UNEQUAL_STROKES * max(left_ml, right_ml):
+        return []
+    return [
+        f"volumes: the left ventricle ejects {left_ml:.0f} ml and the right one {right_ml:.0f} ml; "
+        "where no valve leaks and no shunt is known, look at the contours at base and tip"
+    ]
+
+
+def odd_systole(surface: dict[str, Any]) -> list[str]:
+    """A sentence where the left ventricle is smallest when it cannot be after an R peak.
+
+    Phases that do not begin at the R peak move with the heart as well as others do, and ultrasound
+    fits them at an offset of its clock: nothing else tells, and each force comes at another time.
+    """
+    found = surface.get("end_systole")
+    if not found or surface.get("lv_ejection_fraction", 0.0) < LEAST_EJECTION:
+        return []
+    late = (found["phase"] - found["usual"] + 0.5) % 1 - 0.5
+    if -EARLIEST_SYSTOLE <= late <= LATEST_SYSTOLE:
+        return []
+    return [
+        f"times: the left ventricle is smallest at phase {found['phase']:.2f}, where "
+        f"{found['usual']:.2f} is usual at this heart rate; were images gated by the pulse at a "
+        "finger, by another wave than R, or stored in reverse? Then forces come at the wrong time: "
+        "give times after the R peak"
+    ]

@@ -1,0 +1,106 @@
+"""Slices that do not beat with the others are told, by how they differ; those that do are not.
+
+Truth are discs whose radii follow a curve of area; a disc's pixels count its area within what its
+edge crosses.
+"""
+
+import numpy as np
+import pytest
+
+from data_synth.mr import MrSettings, acquire_cine
+from data_synth.population import draw_heart
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.in_step import out_of_step
+from pipeline.imaging.labels import LABELS
+from pipeline.imaging.segmentation import segment_cine
+from pipeline.imaging.settings import SegmentSettings
+
+PHASES = 20
+
+
+def areas(phases=PHASES, share=0.5):
+    """Of the largest: out within a third of the beat, in over the rest, as a ventricle's."""
+    t = np.arange(phases) / phases
+    out = np.where(t < 0.35, np.sin(np.pi / 2 * t / 0.35), np.cos(np.pi / 2 * (t - 0.35) / 0.65))
+    return 1 - share * out**2
+
+
+def drawn(*curves, radius=16.0):
+    """Cavities ringed by muscle, a slice for each curve of area over the phases."""
+    row, column = np.mgrid[:64, :64] - 32 + 0.3
+    labels = np.zeros((len(curves[0]), len(curves), 64, 64), np.uint8)
+    for z, curve in enumerate(curves):
+        for k, area in enumerate(curve):
+            far = np.hypot(row, column)
+            inner = radius * np.sqrt(area)
+            labels[k, z][far < inner + 8] = LABELS["lv_myocardium"]
+            labels[k, z][far < inner] = LABELS["lv_cavity"]
+    return labels
+
+
+def told(*curves, radius=16.0):
+    phases = np.arange(len(curves[0])) / len(curves[0])
+    return out_of_step(drawn(*curves, radius=radius), phases)
+
+
+def test_slices_that_swing_together_are_not_told_however_far_each_swings():
+    assert told(*(areas(share=share) for share in (0.3, 0.5, 0.6, 0.65, 0.5))) == {}
+
+
+@pytest.mark.parametrize("late", [0.1, 0.25, 0.45, -0.2])
+def test_a_slice_that_beats_late_is_told_with_how_late(late):
+    usual = areas()
+    found = told(usual, usual, np.roll(usual, round(late * PHASES)), usual, usual)
+    assert set(found) == {2}
+    # Steps of 0.01 in which it is sought, and half a phase between which lines stand for curves.
+    assert found[2]["late"] == pytest.approx(late, abs=0.01 + 0.5 / PHASES)
+
+
+def test_most_of_the_slices_say_what_is_usual():
+    usual = areas()
+    late = np.roll(usual, 8)
+    found = told(usual, late, usual, late, usual, late, usual)
+    assert set(found) == {1, 3, 5}
+    assert all(one["late"] == pytest.approx(0.4, abs=0.035) for one in found.values())
+
+
+def test_a_slice_that_shows_one_image_throughout_is_told():
+    usual = areas()
+    found = told(usual, usual, np.full(PHASES, 0.8), usual)
+    assert found == {2: {"swing": 0.0}}
+
+
+def test_a_slice_of_few_phases_in_another_order_is_told():
+    usual = areas(3)
+    found = told(usual, usual[[2, 0, 1]], usual, usual)
+    assert set(found) == {1}
+    assert set(found[1]) == {"swing"}
+    beat = np.array([1.0, 0.5])
+    assert told(beat, beat, beat[::-1], beat)[2]["swing"] < -0.5
+
+
+def test_nothing_is_told_of_the_tip_of_few_slices_and_of_hearts_that_hardly_beat():
+    usual = areas()
+    assert told(usual, usual, 0.15 * np.roll(usual, 8), usual) == {}
+    assert told(usual, np.roll(usual, 8)) == {}
+    still = areas(share=0.06)
+    assert told(still, still, np.roll(still, 8), still) == {}
+    assert out_of_step(np.zeros((PHASES, 5, 8, 8), np.uint8), np.arange(PHASES) / PHASES) == {}
+
+
+def test_a_cine_names_such_a_slice_by_its_own_number():
+    """Stored from base to tip, as the segmentation does not go through it."""
+    rng = np.random.default_rng(7)
+    heart = draw_heart(rng, pathology="healthy")
+    slices = 12
+    mr = MrSettings(phases=3, matrix=110, pixel_mm=2.0, through_plane_samples=2, slices=slices)
+    cine = acquire_cine(rng, heart, [800.0] * slices, mr)
+    upwards = cine.mr_from_index.copy()
+    upwards[:3, 3] += (slices - 1) * upwards[:3, 2]
+    upwards[:3, 2] *= -1
+    images = cine.intensity[:2, ::-1].astype(np.float32)
+    images[:, 7] = images[::-1, 7]
+    settings = SegmentSettings(most_views=1)
+    found = segment_cine(Cine(images, upwards, np.array([0, 1 / 3]), 0.8), settings)
+    assert set(found.out_of_step) == {7}
+    assert found.out_of_step[7]["swing"] < 0
