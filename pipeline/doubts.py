@@ -59,16 +59,18 @@ held in another breath, or labelled wrongly']
 def out_of_step(segment: dict[str, Any]) -> list[str]:
     """Sentences on slices that do not beat with the others.
 
-    >>> out_of_step({"out_of_step": {"4": {"swing": -0.9, "late": 0.4}}})
-    ['slice 4 does not beat with the others (as if 0.40 of a beat late): look at its times and \
-order; between sound neighbours cine.spoilt_slices draws it anew']
+    >>> out_of_step({"out_of_step": {4: {"swing": -0.9, "late": 0.4}, "5": {"swing": 0.01}}})
+    ["slice 4 out of step with the others' heartbeat: as if 0.40 of a beat late; look at times and \
+order, or draw it anew between sound neighbours (cine.spoilt_slices)", "slice 5 out of step with \
+the others' heartbeat: hardly moving, as a scar may, or one image for several phases; look at \
+times and order, or draw it anew between sound neighbours (cine.spoilt_slices)"]
     """
     ways: dict[str, list[str]] = {}
     for number, found in segment.get("out_of_step", {}).items():
-        ways.setdefault(_way(found), []).append(number)
+        ways.setdefault(_way(found), []).append(str(number))
     return [
-        f"slice {', '.join(numbers)} does not beat with the others ({how}): look at its times and "
-        "order; between sound neighbours cine.spoilt_slices draws it anew"
+        f"slice {', '.join(numbers)} out of step with the others' heartbeat: {how}; look at times "
+        "and order, or draw it anew between sound neighbours (cine.spoilt_slices)"
         for how, numbers in ways.items()
     ]
 
@@ -78,11 +80,9 @@ def _way(found: dict[str, float]) -> str:
     if late is not None:
         return f"as if {abs(late):.2f} of a beat {'late' if late > 0 else 'early'}"
     if abs(found["swing"]) < HARDLY:
-        return "it hardly moves, as a scar may, or one image for several phases"
+        return "hardly moving, as a scar may, or one image for several phases"
     return (
-        "it moves against them, as a bulging scar may"
-        if found["swing"] < 0
-        else "it moves otherwise"
+        "moving against them, as a bulging scar may" if found["swing"] < 0 else "moving otherwise"
     )
 
 
