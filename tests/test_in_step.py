@@ -7,13 +7,8 @@ edge crosses.
 import numpy as np
 import pytest
 
-from data_synth.mr import MrSettings, acquire_cine
-from data_synth.population import draw_heart
-from pipeline.imaging.cine import Cine
 from pipeline.imaging.in_step import out_of_step
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import segment_cine
-from pipeline.imaging.settings import SegmentSettings
 
 PHASES = 20
 
@@ -86,21 +81,3 @@ def test_nothing_is_told_of_the_tip_of_few_slices_and_of_hearts_that_hardly_beat
     still = areas(share=0.06)
     assert told(still, still, np.roll(still, 8), still) == {}
     assert out_of_step(np.zeros((PHASES, 5, 8, 8), np.uint8), np.arange(PHASES) / PHASES) == {}
-
-
-def test_a_cine_names_such_a_slice_by_its_own_number():
-    """Stored from base to tip, as the segmentation does not go through it."""
-    rng = np.random.default_rng(7)
-    heart = draw_heart(rng, pathology="healthy")
-    slices = 12
-    mr = MrSettings(phases=3, matrix=110, pixel_mm=2.0, through_plane_samples=2, slices=slices)
-    cine = acquire_cine(rng, heart, [800.0] * slices, mr)
-    upwards = cine.mr_from_index.copy()
-    upwards[:3, 3] += (slices - 1) * upwards[:3, 2]
-    upwards[:3, 2] *= -1
-    images = cine.intensity[:2, ::-1].astype(np.float32)
-    images[:, 7] = images[::-1, 7]
-    settings = SegmentSettings(most_views=1)
-    found = segment_cine(Cine(images, upwards, np.array([0, 1 / 3]), 0.8), settings)
-    assert set(found.out_of_step) == {7}
-    assert found.out_of_step[7]["swing"] < 0

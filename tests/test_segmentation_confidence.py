@@ -415,3 +415,17 @@ def test_slices_far_aside_are_named_by_the_cines_own_numbers():
     """The apex is the stack's last slice; what lies along the normal is not aside."""
     shifts_mm = np.array([[0.5, -0.5, 0], [-9.0, 12.0, 0], [5, -5, 20]])
     assert _astray_mm(shifts_mm, np.array([7, 4, 2])) == {4: 15.0}
+
+
+def test_a_slice_out_of_step_is_named_by_the_cines_own_number(study, understood):
+    """Stored from base to tip, as the segmentation does not go through it."""
+    assert understood.out_of_step == {}
+    cine = study[0]
+    downwards = cine.mr_from_index.copy()
+    downwards[:3, 3] += (SLICES - 1) * downwards[:3, 2]
+    downwards[:3, 2] *= -1
+    images = cine.intensity[:, ::-1].copy()
+    images[:, 5] = images[::-1, 5]
+    found = segment_cine(replace(cine, intensity=images, mr_from_index=downwards), QUICK)
+    assert set(found.out_of_step) == {5}
+    assert found.out_of_step[5]["swing"] < 0
