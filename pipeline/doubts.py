@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from pipeline.imaging.settings import LOW_CONFIDENCE
@@ -59,17 +61,17 @@ held in another breath, or labelled wrongly']
 def out_of_step(segment: dict[str, Any]) -> list[str]:
     """Sentences on slices that do not beat with the others.
 
-    >>> out_of_step({"out_of_step": {4: {"swing": -0.9, "late": 0.4}, "5": {"swing": 0.01}}})
+    >>> out_of_step({"out_of_step": {4: {"swing": -0.9, "late": 0.4}, "7": {"swing": 0.01}}})
     ["slice 4 out of step with the others' heartbeat: as if 0.40 of a beat late; look at times and \
-order, or draw it anew between sound neighbours (cine.spoilt_slices)", "slice 5 out of step with \
+order, or draw it anew between sound neighbours (cine.spoilt_slices)", "slice 7 out of step with \
 the others' heartbeat: hardly moving, as a scar may, or one image for several phases; look at \
 times and order, or draw it anew between sound neighbours (cine.spoilt_slices)"]
     """
-    ways: dict[str, list[str]] = {}
+    ways: dict[str, list[int]] = {}
     for number, found in segment.get("out_of_step", {}).items():
-        ways.setdefault(_way(found), []).append(str(number))
+        ways.setdefault(_way(found), []).append(int(number))
     return [
-        f"slice {', '.join(numbers)} out of step with the others' heartbeat: {how}; look at times "
+        f"slice {ranges(numbers)} out of step with the others' heartbeat: {how}; look at times "
         "and order, or draw it anew between sound neighbours (cine.spoilt_slices)"
         for how, numbers in ways.items()
     ]
@@ -188,3 +190,15 @@ def odd_systole(surface: dict[str, Any]) -> list[str]:
         "finger, by another wave than R, or stored in reverse? Then forces come at the wrong time: "
         "give times after the R peak"
     ]
+
+
+def ranges(numbers: Sequence[int]) -> str:
+    """Rising numbers in words.
+
+    >>> ranges((0, 1, 2, 5, 7, 8))
+    '0 to 2, 5, 7 to 8'
+    """
+    starts = [numbers[0], *(b for a, b in pairwise(numbers) if b > a + 1)]
+    ends = [*(a for a, b in pairwise(numbers) if b > a + 1), numbers[-1]]
+    parts = [f"{a} to {b}" if b > a else f"{a}" for a, b in zip(starts, ends, strict=True)]
+    return ", ".join(parts)

@@ -21,6 +21,7 @@ from matplotlib.quiver import Quiver
 from PIL import Image
 
 from pipeline.config import Settings
+from pipeline.doubts import ranges
 from pipeline.errors import StageError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.labels import LABELS
@@ -195,7 +196,7 @@ def test_doubts_name_slice_and_phases_worst_first() -> None:
     confidence[4, 3] = 0.4
     first, second = slices.doubts(confidence, 0.8)
     assert first == (3, (4,), 0.4)
-    assert (second.slice, slices.ranges(second.phases)) == (1, "1 to 3, 6")
+    assert (second.slice, ranges(second.phases)) == (1, "1 to 3, 6")
 
 
 def axis_of(figure: Figure) -> Axes:

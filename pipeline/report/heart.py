@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.doubts import ranges
 from pipeline.geometry import Float, MovingSurface
 from pipeline.report import curves, slices
 from pipeline.report.animation import NoAnimation, beating_surfaces, first_frame
@@ -50,8 +51,7 @@ def _seen(shown: Moments, confidence: Float, always: list[int]) -> str:
 
 def _doubt_table(found: list[slices.Doubt]) -> Table:
     rows = [
-        (str(one.slice), slices.ranges(one.phases), f"{one.lowest:.2f}")
-        for one in found[:MOST_DOUBTS]
+        (str(one.slice), ranges(one.phases), f"{one.lowest:.2f}") for one in found[:MOST_DOUBTS]
     ]
     if len(found) > MOST_DOUBTS:
         rows.append((f"and {len(found) - MOST_DOUBTS} more", "", ""))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from math import ceil
 from typing import Any, NamedTuple
 
@@ -242,18 +241,6 @@ def doubts(confidence: Float, low: float) -> list[Doubt]:
         if len(below):
             found.append(Doubt(number, tuple(below.tolist()), float(curve[below].min())))
     return sorted(found, key=lambda one: (one.lowest, one.slice))
-
-
-def ranges(numbers: tuple[int, ...]) -> str:
-    """Rising numbers in words.
-
-    >>> ranges((0, 1, 2, 5, 7, 8))
-    '0 to 2, 5, 7 to 8'
-    """
-    starts = [numbers[0], *(b for a, b in pairwise(numbers) if b > a + 1)]
-    ends = [*(a for a, b in pairwise(numbers) if b > a + 1), numbers[-1]]
-    parts = [f"{a} to {b}" if b > a else f"{a}" for a, b in zip(starts, ends, strict=True)]
-    return ", ".join(parts)
 
 
 def lowest_place(confidence: Float) -> str:
