@@ -20,6 +20,11 @@ MOST_EJECTED = 0.85
 """Share of its largest volume that a left ventricle ejects at most: of 20 phantoms the
 most was 0.75, and labels of a ventricle that metal had half erased 0.94."""
 
+LEAST_AGREEING = 0.5
+"""Share of the lines where a long-axis view crosses slices along which both are to agree: views of
+ten phantoms did along 0.87 and more, at other phases along 0.4 to 0.7, mirrored or exchanged along
+0.15 at most."""
+
 UNEQUAL_STROKES = 0.15
 """By what share of the larger one stroke volumes may differ: those found in nine studies of the
 phantom, whose valves are tight, did by 0.08 at most."""
@@ -33,14 +38,15 @@ LEAST_EJECTION = 0.15
 """Of a heart that ejects less than this share, noise decides when it is smallest."""
 
 HARDLY = 0.25
-"""Of the other slices' swing: what a slice has that hardly moves."""
+"""Of the other slices' swing: a slice that swings less hardly moves."""
 
 
 def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
     """Sentences on what speaks against labels or times, of the figures of two stages."""
     of_slices = *low_confidence(segment), *astray(segment), *out_of_step(segment)
+    of_views = disagreeing_views(segment)
     of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface)
-    of_labels = *of_slices, *muscle_changes(segment), *odd_ejection(segment)
+    of_labels = *of_slices, *of_views, *muscle_changes(segment), *odd_ejection(segment)
     return [*of_labels, *of_surfaces, *lost_pieces(surface), *crossings(surface)]
 
 
@@ -61,31 +67,64 @@ held in another breath, or labelled wrongly']
 def out_of_step(segment: dict[str, Any]) -> list[str]:
     """Sentences on slices that do not beat with the others.
 
-    >>> out_of_step({"out_of_step": {4: {"swing": -0.9, "late": 0.4}, "7": {"swing": 0.01}}})
-    ["slice 4 out of step with the others' heartbeat: as if 0.40 of a beat late; look at times and \
-order, or draw it anew between sound neighbours (cine.spoilt_slices)", "slice 7 out of step with \
-the others' heartbeat: hardly moving, as a scar may, or one image for several phases; look at \
-times and order, or draw it anew between sound neighbours (cine.spoilt_slices)"]
+    >>> late, still = {"swing": 1.0, "in_step": -0.9, "late": 0.4}, {"swing": 0.01, "in_step": 0.0}
+    >>> for sentence in out_of_step({"out_of_step": {"6": late, 5: still, "4": late}}):
+    ...     print(sentence)
+    slice 4, 6 out of step with the others' heartbeat: as if 0.40 of a beat late; look at its \
+times, order and contours
+    slice 5 out of step with the others' heartbeat: hardly moving, as a scar may, or one image for \
+several phases; look at its times, order and contours
     """
-    ways: dict[str, list[int]] = {}
-    for number, found in segment.get("out_of_step", {}).items():
-        ways.setdefault(_way(found), []).append(int(number))
+    told = segment.get("out_of_step", {})
+    late = {int(number): found["late"] for number, found in told.items() if "late" in found}
+    ways: dict[str, list[int]] = {_how_late(sorted(late.values())): sorted(late)} if late else {}
+    for number, found in told.items():
+        if "late" not in found:
+            ways.setdefault(_way(found), []).append(int(number))
     return [
-        f"slice {ranges(numbers)} out of step with the others' heartbeat: {how}; look at times "
-        "and order, or draw it anew between sound neighbours (cine.spoilt_slices)"
+        f"slice {ranges(sorted(numbers))} out of step with the others' heartbeat: {how}; look at "
+        "its times, order and contours"
         for how, numbers in ways.items()
     ]
 
 
+def _how_late(late: list[float]) -> str:
+    """The least and the most of rising shares of a beat, in words.
+
+    >>> _how_late([0.38, 0.4]), _how_late([-0.2]), _how_late([-0.11, 0.14])
+    ('as if 0.38 to 0.40 of a beat late', 'as if 0.20 of a beat early', \
+'as if 0.11 of a beat early to 0.14 late')
+    """
+    first, last = (f"{abs(one):.2f}" for one in (late[0], late[-1]))
+    if late[0] < 0 < late[-1]:
+        return f"as if {first} of a beat early to {last} late"
+    both = first if first == last else " to ".join(sorted([first, last]))
+    return f"as if {both} of a beat {'late' if late[0] > 0 else 'early'}"
+
+
 def _way(found: dict[str, float]) -> str:
-    late = found.get("late")
-    if late is not None:
-        return f"as if {abs(late):.2f} of a beat {'late' if late > 0 else 'early'}"
-    if abs(found["swing"]) < HARDLY:
+    if found["swing"] < HARDLY:
         return "hardly moving, as a scar may, or one image for several phases"
     return (
-        "moving against them, as a bulging scar may" if found["swing"] < 0 else "moving otherwise"
+        "moving against them, as a bulging scar may" if found["in_step"] < 0 else "moving otherwise"
     )
+
+
+def disagreeing_views(segment: dict[str, Any]) -> list[str]:
+    """A sentence for each long-axis view that does not show what the slices show.
+
+    >>> disagreeing_views({"views_agree": {"two_chamber": [14, 15], "four_chamber": [1, 13]}})
+    ['long-axis view four_chamber agrees with the slices along 1 of 13 lines where it crosses \
+them: is it mirrored, of other times, another place or another patient? Where it does not agree \
+it moves no slice']
+    """
+    return [
+        f"long-axis view {name} agrees with the slices along {agree} of {lines} lines where it "
+        "crosses them: is it mirrored, of other times, another place or another patient? Where "
+        "it does not agree it moves no slice"
+        for name, (agree, lines) in segment.get("views_agree", {}).items()
+        if agree < LEAST_AGREEING * lines
+    ]
 
 
 def lost_pieces(surface: dict[str, Any]) -> list[str]:

@@ -122,6 +122,14 @@ def test_one_image_in_several_phases_of_a_slice_is_told() -> None:
     )
 
 
+def test_slices_of_repeated_images_are_named_together_and_few_sets_one_by_one() -> None:
+    cine = noisy(phases=12)
+    cine.intensity[1::2, 1:3] = cine.intensity[::2, 1:3]
+    told = require_different_images(cine, "here")
+    assert told[0] == "slice 1, 2 shows one image in phases 0 1"
+    assert told[3:] == ("slices show one image in 3 more sets of phases",)
+
+
 def test_a_heart_that_never_moves_is_refused() -> None:
     """As two files of which one was copied from the other."""
     cine = noisy(phases=2)
@@ -135,11 +143,16 @@ def test_a_heart_that_never_moves_is_refused() -> None:
 
 
 def test_what_a_window_cut_off_is_told() -> None:
-    cine = noisy(slices=40)
+    """A tenth of each image; not what fills images up in all phases."""
+    rng = np.random.default_rng(3)
+    values = rng.normal(100, 5, (4, 5, 40, 40)).astype(np.float32)
+    cine = Cine(values, STEP_8_MM, np.arange(4) / 4, 0.8)
     assert doubts_of_range(cine) == ()
-    most = float(np.quantile(cine.intensity, 0.9))
-    (told,) = doubts_of_range(replace(cine, intensity=np.minimum(cine.intensity, most)))
-    assert told.startswith("10% of the pixels have the largest of all values")
+    most = np.quantile(values, 0.9, axis=(2, 3), keepdims=True)
+    (told,) = doubts_of_range(replace(cine, intensity=np.minimum(values, most)))
+    assert told.startswith("10% of the pixels have the largest value of their image")
+    values[..., :20] = 200
+    assert doubts_of_range(cine) == ()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -405,6 +405,11 @@ def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
     crossings = find_crossings(cine, [off, *views[1:]], view, drawn)
     seen = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
     assert left_mm(truth[:, :2] - seen) < left_mm(truth[:, :2] - smooth)
+    agree, lines = np.transpose([crossings.agreement(k) for k in range(3)])
+    assert np.all(lines >= SLICES // 2)
+    assert np.all(agree[1:] > lines[1:] / 2)
+    if wrong == "another body":
+        assert agree[0] < lines[0] / 2
 
 
 def test_a_view_that_contradicts_slices_and_views_is_left_out_of_the_equations() -> None:

@@ -12,12 +12,16 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.cine import Cine, Stack
+from pipeline.imaging.dicom_pixels import at_the_edge
 from pipeline.imaging.frames import MIN_SLICES
 from pipeline.imaging.spacing import WIDEST_GAP_MM
 from pipeline.imaging.stored_order import small_images
 
 MOST_BRIGHTEST = 0.05
-"""Share of the pixels that may have the largest of all values: of what was measured few have."""
+"""Share of pixels that may have the largest value of their image: of what was measured few have."""
+
+MOST_REPEATED = 3
+"""Sets of phases that are named one by one."""
 
 LEAST_VIEW_MM = 60.0
 """Sides of images that show a left ventricle with its wall."""
@@ -205,12 +209,17 @@ def require_different_images(cine: Cine, where: str) -> tuple[str, ...]:
 
 def _repeated(which: Integer, phases: Integer) -> Iterator[str]:
     """Slices that show one image in several phases, in words."""
+    slices: dict[tuple[int, ...], list[int]] = {}
     for number, column in enumerate(which.T):
         for image in np.unique(column[column >= 0]):
-            alike = phases[column == image]
+            alike = tuple(phases[column == image].tolist())
             if len(alike) > 1:
-                listed = " ".join(map(str, alike))
-                yield f"slice {number} shows one image in phases {listed}"
+                slices.setdefault(alike, []).append(number)
+    for alike, numbers in list(slices.items())[:MOST_REPEATED]:
+        named = f"slice {', '.join(map(str, numbers))} shows one image in phases"
+        yield f"{named} {' '.join(map(str, alike))}"
+    if len(slices) > MOST_REPEATED:
+        yield f"slices show one image in {len(slices) - MOST_REPEATED} more sets of phases"
 
 
 def _numbered(cine: Cine) -> Integer:
@@ -235,12 +244,15 @@ def _equal_columns(which: Integer) -> list[tuple[int, int]]:
 
 def doubts_of_range(cine: Cine) -> tuple[str, ...]:
     """Whether bright tissues share one value, as after a window that cut them off, in words."""
-    most = cine.intensity.max()
-    share = float((cine.intensity == most).mean())
+    images = cine.intensity
+    most = images.max(axis=(2, 3), keepdims=True)
+    brightest = (images == most) & (images.min(axis=(2, 3), keepdims=True) < most)
+    # What is so in all phases and reaches the edge fills up about what was recorded.
+    fills = np.stack([at_the_edge(one) for one in brightest.all(axis=0)])
+    share = float((brightest & ~fills).sum() / max(images[:, ~fills].size, 1))
     if share <= MOST_BRIGHTEST:
         return ()
     return (
-        f"{share:.0%} of the pixels have the largest of all values, {most:g}, as where a window "
-        "cut off what is brighter: export the images' own values, or blood and muscle may "
-        "look alike",
+        f"{share:.0%} of the pixels have the largest value of their image, as where a window cut "
+        "off what is brighter: export the images' own values, or blood and muscle may look alike",
     )

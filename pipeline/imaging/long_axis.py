@@ -72,6 +72,13 @@ class Crossings:
     precision: Float
     """``(n, 3, 3)`` inverse covariance, 1/mm2."""
 
+    compared: tuple[int, ...] = ()
+    """Number of the view of every line that was compared, whether both agree along it or not."""
+
+    def agreement(self, view: int) -> tuple[int, int]:
+        """Along how many lines a view agrees with the stack, and of how many."""
+        return self.views.count(view), self.compared.count(view)
+
     def without(self, view: int) -> Crossings:
         """All but those of one view."""
         kept = [k for k, other in enumerate(self.views) if other != view]
@@ -80,6 +87,7 @@ class Crossings:
             tuple(self.views[k] for k in kept),
             self.offsets_mm[kept],
             self.precision[kept],
+            self.compared,
         )
 
 
@@ -107,23 +115,30 @@ def find_crossings(cine: Cine, views: Sequence[Cine], view: View, drawn: Label) 
     """
     if view.slice_step_mm < LEAST_STEP_MM:
         return NO_CROSSINGS
-    slices, numbers, offsets_mm, precision = [], [], [], []
+    slices, numbers, compared, offsets_mm, precision = [], [], [], [], []
     acquired = np.flatnonzero(~np.isin(view.order, cine.interpolated))
     for place, number in enumerate(acquired.tolist()):
         heart_mm = _heart_mm(drawn[:, number], view.pixel_mm)
         for k, other in enumerate(views):
             line = _line(cine, other, view, number, heart_mm)
-            found = None if line is None else _compare(cine, other, line, view.order[number])
-            if line is not None and found is not None:
+            if line is None:
+                continue
+            compared.append(k)
+            found = _compare(cine, other, line, view.order[number])
+            if found is not None:
                 # Slice and view show one place where they are moved apart by what the axes sum to.
                 axes = view.axes @ (line.axes * (1, 1, -1))
                 slices.append(place)
                 numbers.append(k)
                 offsets_mm.append(axes @ found[0])
                 precision.append(np.linalg.inv(axes @ found[1] @ axes.T))
-    if not slices:
-        return NO_CROSSINGS
-    return Crossings(tuple(slices), tuple(numbers), np.array(offsets_mm), np.array(precision))
+    return Crossings(
+        tuple(slices),
+        tuple(numbers),
+        np.reshape(offsets_mm, (-1, 3)),
+        np.reshape(precision, (-1, 3, 3)),
+        tuple(compared),
+    )
 
 
 @dataclass(frozen=True, slots=True)

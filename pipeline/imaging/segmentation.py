@@ -90,6 +90,10 @@ class Segmentation:
     out_of_step: dict[int, dict[str, float]]
     """Slices that do not beat with the others (`pipeline.imaging.in_step.out_of_step`)."""
 
+    views: tuple[tuple[int, int], ...]
+    """Along how many of the lines where each long-axis view crosses slices both agree, and of how
+    many (`pipeline.imaging.long_axis`)."""
+
     orientation: Orientation
     """How the heart was found to lie, against what the file says. All products are in the file's
     frame, whichever it is."""
@@ -152,14 +156,15 @@ def segment_cine(
     heart, heart_mr_from_index = _isotropic(found, settings, shifts_mm, acquired)
     stored = np.argsort(found.view.order)
     numbers = np.asarray(found.view.order)[acquired]
-    apart = out_of_step(drawn[:, acquired], cine.phases)
+    apart = out_of_step(drawn[:, acquired], cine.phases, found.view.pixel_mm)
     return Segmentation(
         labels,
         heart,
         heart_mr_from_index,
         confidence[:, stored],
         _astray_mm(shifts_mm, numbers),
-        {int(numbers[place]): apart[place] for place in apart},
+        {int(numbers[place]): apart[place] for place in sorted(apart, key=lambda k: numbers[k])},
+        tuple(crossings.agreement(k) for k in range(len(views))),
         place.orientation,
     )
 

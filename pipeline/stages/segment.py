@@ -16,8 +16,9 @@ from pipeline.products import read_cine, read_long_axis, write_labels, write_tab
 def run(job: Job) -> dict[str, Any]:
     """Write labels on the cine's own slices and the same heart on an isotropic grid."""
     cine = read_cine(job.products / "ingest")
-    views = [view.cine for view in read_long_axis(job.products / "ingest")]
-    found = segment_cine(cine, job.settings.segment, job.progress, views)
+    views = read_long_axis(job.products / "ingest")
+    images = [view.cine for view in views]
+    found = segment_cine(cine, job.settings.segment, job.progress, images)
     write_labels(job.folder, "labels", found.labels, cine.mr_from_index)
     write_labels(job.folder, "heart", found.heart, found.heart_mr_from_index)
     write_table(job.folder / "labels.json", LABELS)
@@ -38,6 +39,7 @@ def run(job: Job) -> dict[str, Any]:
         "cut_sideways": cut_sideways(found.labels, cine.intensity),
         "astray_mm": found.astray_mm,
         "out_of_step": found.out_of_step,
+        "views_agree": {one.name: lines for one, lines in zip(views, found.views, strict=True)},
         "orientation": str(found.orientation),
         "mirror_image": found.orientation.is_mirror_image,
         "volumes_ml": volumes,
