@@ -54,6 +54,8 @@ def out_of_step(labels: Label, phases: Float, pixel_mm: float) -> dict[int, dict
         ``(phase, slice, row, column)``: slices that are images of their own.
     phases
         ``(phase,)`` shares of the beat.
+    pixel_mm
+        Side of a pixel.
 
     Returns
     -------
