@@ -18,13 +18,12 @@ from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.segmentation import (
-    _astray_mm,
+from pipeline.imaging.no_heart import (
     _require_cavity,
     _require_right_ventricle,
     missed_hearts,
-    segment_cine,
 )
+from pipeline.imaging.segmentation import _astray_mm, segment_cine
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import view_of
 
