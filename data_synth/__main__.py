@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import signal
 import sys
 import threading
@@ -23,8 +25,10 @@ LATER_S = 0.05
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit code: 0 done, 2 the command or the settings are wrong, 130 it was
-    told to end."""
+    told to end, 141 nobody reads what it prints."""
     options = _parser().parse_args(arguments)
+    # No picture needs a window.
+    os.environ["MPLBACKEND"] = "agg"
     from data_synth.errors import SynthError
 
     try:
@@ -38,7 +42,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("interrupted; studies that are finished are kept\n")
         return INTERRUPTED_CODE
+    except BrokenPipeError:
+        # Who reads has read enough; the exit code is that of programs which this signal ends.
+        _silence()
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        # Of a file there would be its name.
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or error.filename is not None:
+            raise
+        _silence()
+        sys.stderr.write(f"error: what is printed cannot be written ({error.strerror})\n")
+        return SynthError.exit_code
     return 0
+
+
+def _silence() -> None:
+    """What is left to be printed goes nowhere, so that the end does not fail for it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _end_cleanly() -> None:
@@ -95,6 +115,7 @@ def _write_patients(options: argparse.Namespace) -> None:
         finally:
             line.end()
         sys.stdout.write(f"{folder}\n")
+        sys.stdout.flush()
 
 
 def _changes(options: argparse.Namespace) -> dict[str, Any]:

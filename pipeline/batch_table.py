@@ -120,6 +120,7 @@ def _figures(stages: Mapping[str, Any]) -> dict[str, float | None]:
         volumes_ml = stages.get("surface", {}).get("figures", {}).get("volumes_ml", {})
         return pick(volumes_ml[chamber]) if chamber in volumes_ml else None
 
+    off_mm = figure("bake", "accuracy", "distance_error_max_mm")
     return {
         "lv_ejection_fraction": figure("surface", "lv_ejection_fraction"),
         "rv_ejection_fraction": figure("surface", "rv_ejection_fraction"),
@@ -129,7 +130,7 @@ def _figures(stages: Mapping[str, Any]) -> dict[str, float | None]:
         "rv_end_systolic_volume_ml": volume("rv_endocardium", min),
         "lv_mass_g": figure("surface", "lv_mass_g"),
         "target_registration_error_mm": figure("evaluate", "target_registration_error_mm"),
-        "largest_distance_error_mm": figure("bake", "accuracy", "distance_error_max_mm"),
+        "largest_distance_error_mm": None if off_mm is None else round(off_mm, 3),
         "expected_tre_mm": figure("register", "expected_tre_mm"),
     }
 

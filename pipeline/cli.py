@@ -8,6 +8,7 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import warnings
@@ -410,9 +411,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> Any:
         _require_no_empty(given)
         provide_place()
+        _settle_libraries()
         return app(arguments, exit_on_error=False, print_error=True)
 
     return guarded(command)
+
+
+def _settle_libraries() -> None:
+    """No picture needs a window, and nothing works without the compiler.
+
+    Raises
+    ------
+    InputError
+        When the environment turns the compiler off.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    if os.environ.get("NUMBA_DISABLE_JIT", "0").strip() not in ("", "0"):
+        raise InputError("NUMBA_DISABLE_JIT turns the compiler off, which is needed; unset it")
+    threads = os.environ.get("NUMBA_NUM_THREADS", "").strip()
+    if threads.startswith("-") or threads == "0":
+        raise InputError(f"NUMBA_NUM_THREADS is {threads}; give 1 or more, or unset it")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from contextlib import suppress
 from pathlib import Path
@@ -37,6 +38,10 @@ def require_text_name(path: Path) -> None:
     try:
         str(path).encode()
     except UnicodeEncodeError as error:
-        raise InputError(
-            f"{path}: its name is no UTF-8 text; rename that file or folder"
-        ) from error
+        try:
+            os.fsencode(path).decode()
+        except UnicodeDecodeError:
+            wrong = "its name is no UTF-8 text; rename that file or folder"
+        else:
+            wrong = "this shell's locale lacks letters of its name; set LC_ALL=C.UTF-8"
+        raise InputError(f"{path}: {wrong}") from error

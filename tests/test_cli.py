@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from data_synth.__main__ import main as synthesise
 from data_synth.settings_table import settings_table
 from pipeline.cli import main
 from pipeline.config import Settings
@@ -422,3 +423,38 @@ def test_a_reader_that_has_read_enough_gets_no_traceback(stream: str) -> None:
     )
     os.close(writing)
     assert (done.returncode, getattr(done, other)) == (141, b"")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("NUMBA_DISABLE_JIT", "1", "NUMBA_DISABLE_JIT turns the compiler off"),
+        ("NUMBA_NUM_THREADS", "0", "NUMBA_NUM_THREADS is 0; give 1 or more"),
+        ("NUMBA_NUM_THREADS", "-2", "NUMBA_NUM_THREADS is -2; give 1 or more"),
+    ],
+)
+def test_an_environment_that_nothing_works_in_is_told(monkeypatch, capsys, name, value, words):
+    monkeypatch.setenv(name, value)
+    assert main(["verify", "none.zarr"]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("error", "code"), [(BrokenPipeError(), 141), (OSError(28, "full"), 2)])
+def test_synthetic_studies_are_written_although_nobody_reads_their_names(
+    monkeypatch, tmp_path, capsys, error, code
+):
+    class Deaf:
+        def __init__(self, file):
+            self.fileno = file.fileno
+
+        def write(self, text):
+            raise error
+
+    made = []
+    monkeypatch.setattr("data_synth.study.write_study", lambda folder, *_: made.append(folder))
+    monkeypatch.setattr("data_synth.__main__._end_cleanly", lambda: None)
+    with (tmp_path / "out").open("w") as file:
+        monkeypatch.setattr(sys, "stdout", Deaf(file))
+        assert synthesise([str(tmp_path / "studies")]) == code
+    assert len(made) == 1
+    assert ("cannot be written (full)" in capsys.readouterr().err) == (code == 2)

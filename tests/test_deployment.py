@@ -24,6 +24,7 @@ from pipeline.errors import InputError
 from pipeline.imaging.metaimage import read_metaimage
 from pipeline.meshes import read_mesh
 from pipeline.publish import locked
+from pipeline.regular_files import require_text_name
 from pipeline.report import pictures
 from pipeline.study import open_study
 
@@ -260,6 +261,9 @@ def test_names_that_are_no_text_are_refused_before_a_library_ends_the_program(tm
         path = odd if refused in (open_study, locked_once) else odd / "us.mha"
         with pytest.raises(InputError, match="is no UTF-8 text; rename"):
             refused(path)
+    # As Python reads a right name where the shell has no letters but ASCII's.
+    with pytest.raises(InputError, match="locale lacks letters"):
+        require_text_name(Path(b"caf\xc3\xa9".decode("ascii", "surrogateescape")))
     with pytest.raises(SynthError, match=r"L.xfctin/new: is no UTF-8 text"):
         write_study(odd / "new", PhantomSettings())
     assert not (odd / "new").exists()

@@ -138,6 +138,64 @@ def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     assert said["drift_max_mm"] == pytest.approx(off_mm.max(), rel=0.5)
 
 
+@pytest.mark.parametrize("count", [10, 15])
+def test_how_unsure_the_motion_is_is_what_it_misses_of_the_phantom(count):
+    """Truth: the phantom's vertices halfway, along its normals. What one left out is missed by is
+    over the step doubled, so it tells the order alone."""
+    heart = draw_heart(np.random.default_rng(12), heart_rate_bpm=70.0)
+    phases = np.arange(count) / count
+    each = [heart.surfaces(phase, ["epicardium"])["epicardium"] for phase in phases.tolist()]
+    motion = Motion.of(MovingSurface(np.stack([one[0] for one in each]), each[0][1], phases))
+    missed = []
+    for phase in (phases + 0.5 / count).tolist():
+        vertices_mm, triangles = heart.surfaces(phase, ["epicardium"])["epicardium"]
+        normals = pyvista.PolyData.from_regular_faces(vertices_mm, triangles).point_normals
+        off_mm = motion.at(phase).vertices_mm - vertices_mm
+        missed.append((off_mm * normals).sum(axis=1))
+    unsure_mm = motion.unsure_mm()
+    ratio = np.sqrt(np.square(missed).mean() / np.square(unsure_mm).mean())
+    assert 0.4 < ratio < 2.5
+    # And which parts of the beat are the least sure.
+    assert np.corrcoef(np.abs(missed).mean(axis=1), unsure_mm.mean(axis=1))[0, 1] > 0.3
+
+
+@pytest.mark.parametrize("phases", [np.arange(9) / 9, np.array([0.0, 0.1, 0.2, 0.45, 0.6])])
+def test_the_motion_is_sure_of_what_rests_and_of_what_moves_along_the_surface(phases):
+    """A ball that swings along x is unsure by the part of its way that is across the surface."""
+    ball = sphere(20.0, 3)
+    ways_mm = np.outer(4 * np.sin(2 * np.pi * phases), [1.0, 0, 0])[:, None]
+    rest, swing = (
+        Motion.of(MovingSurface(ball.vertices_mm + ways, ball.triangles, phases)).unsure_mm()
+        for ways in (0 * ways_mm, ways_mm)
+    )
+    assert rest.max() < 1e-12
+    # A sine is no spline.
+    most_mm = swing.max(axis=1, keepdims=True)
+    assert most_mm.min() > 1e-5
+    # The mesh's normals are those of the ball to a fiftieth.
+    across = np.abs(ball.vertices_mm[:, 0]) / 20
+    assert np.abs(swing / most_mm - across).max() < 0.02
+
+
+def test_a_guess_between_few_phases_bends_the_distance_about_the_surface_less(
+    tmp_path, monkeypatch
+):
+    """Truth: VTK's distance at the stored phases. A motion faster than nine phases can show."""
+    ball = sphere(1.0, 4)
+    phases = np.arange(9) / 9
+    long_mm = 20 + 3 * np.cos(2 * np.pi * phases) + 2 * np.cos(8 * np.pi * phases)
+    radii_mm = np.stack([long_mm, np.full(9, 18.0), np.full(9, 16.0)], axis=1)
+    moving = {"ball": MovingSurface(ball.vertices_mm * radii_mm[:, None], ball.triangles, phases)}
+    fixtures = {"g": Fixture(structure="ball", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
+    settings = BakeSettings(spacing_mm=2.5, samples=200, bounds={})
+    weighed = bake_field(tmp_path / "weighed.zarr", moving, fixtures, settings)
+    monkeypatch.setattr(Motion, "unsure_mm", lambda self: np.zeros(self.places_mm.shape[:2]))
+    alike = bake_field(tmp_path / "alike.zarr", moving, fixtures, settings)
+    for name in ("gradient_error_p99", "distance_error_p99_mm"):
+        assert weighed[name] < 0.7 * alike[name]
+    assert weighed["motion_unsure_p99_mm"] > 0.5
+
+
 @pytest.mark.parametrize("end", [1.0, 0.9, 0.8, 0.7])
 def test_where_no_phase_is_for_long_errors_of_the_phases_do_not_grow(end):
     """Independent errors of the places are multiplied by the root of the summed squared weights:

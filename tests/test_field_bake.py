@@ -126,6 +126,7 @@ def test_drift_is_unknown_where_vertices_do_not_correspond(tmp_path):
     }
     said = bake_field(tmp_path / "f.zarr", moving, BOX_FIXTURE, SETTINGS)
     assert said["drift_max_mm"] is None
+    assert said["motion_unsure_p99_mm"] is None
 
 
 def test_force_change_is_bounded_by_stiffness_and_motion(tmp_path):
@@ -324,7 +325,7 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
     for name, one in measured["fixtures"].items():
         law, most = one["stiffness_n_per_m"], one["stiffness_measured_n_per_m"]
         line = next(line for line in printed.splitlines() if line.startswith(name))
-        assert f"{law:.0f} N/m by its law, at most {most:.0f} as measured" in line
+        assert f"{law:.0f} N/m by its law, at most {most:.0f} along the force as measured" in line
     for way_mm, size, words in (
         (0.0, 1.01, r"box, phase 0: 12 triangles around .* ml, not 12 around"),
         (1.0, 1.0, "up to 1.00 mm beside what"),

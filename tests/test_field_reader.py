@@ -375,7 +375,8 @@ def test_query_says_what_the_device_has_to_follow(path, field):
     certified = field.accuracy["fixtures"]["guide"]["stiffness_measured_n_per_m"]
     assert answer["stiffness_measured_n_per_m"] == certified
     assert stiffness_words(answer) == (
-        f"stiffness 386 N/m by its law, at most {certified:.0f} as measured; the device renders 400"
+        f"stiffness 386 N/m by its law, at most {certified:.0f} along the force as measured; "
+        "the device renders 400"
     )
     alone = {"stiffness_n_per_m": 386.0, "stiffness_measured_n_per_m": None}
     said = stiffness_words({**alone, "stiffness_limit_n_per_m": None})

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import matplotlib
 import numpy as np
 import pytest
 from field_baked import RADII_MM, RR_S
@@ -63,8 +64,10 @@ def test_a_field_alone_gives_its_parts_and_says_what_is_left_out(field_path, tmp
 
 
 def test_the_same_command_writes_the_same_bytes(field_path, tmp_path):
-    for name in ("a", "b"):
-        assert paper(tmp_path / name, field_path, "--only", "figure-2") == 0
+    """Whatever a user's own figures look like."""
+    assert paper(tmp_path / "a", field_path, "--only", "figure-2") == 0
+    with matplotlib.rc_context({"axes.facecolor": "black", "text.usetex": True}):
+        assert paper(tmp_path / "b", field_path, "--only", "figure-2") == 0
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
     for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

@@ -8,6 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -114,11 +115,15 @@ def test_the_movie_has_every_phase_and_moves(html: str, study: SyntheticStudy) -
 
 
 def test_the_same_study_gives_the_same_page(
-    study: SyntheticStudy, monkeypatch: pytest.MonkeyPatch
+    study: SyntheticStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where no surfaces can be drawn; the page says so then, and shows the rest."""
+    """Whatever a user's own figures look like; also where no surfaces can be drawn: the page says
+    so then, and shows the rest."""
     monkeypatch.setattr(scene, "draw_scenes", lambda *_: {})
-    first, again = page.render_page(study), page.render_page(study)
+    write_preview(tmp_path / "first.html", study)
+    with matplotlib.rc_context({"image.origin": "lower", "text.usetex": True}):
+        write_preview(tmp_path / "again.html", study)
+    first, again = (path.read_text() for path in (tmp_path / "first.html", tmp_path / "again.html"))
     assert first == again
     assert "could be drawn in three dimensions" in first
     assert len(pictures(first)) > 5

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -33,6 +34,7 @@ from pipeline.report.page import Opening, figure_row, render
 from pipeline.report.provenance import provenance
 from pipeline.report.style import as_png, as_svg, as_webp
 from pipeline.sealing import digest_of_files
+from pipeline.stages import report as report_stage
 
 PAGE_LIMIT_BYTES = 6_000_000
 
@@ -445,7 +447,7 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
         {"node_error_near_mm": 0.001, "sign_errors": 0},
     )
     assert forces.rows == [
-        ("soft", "321", "391", "323", "1237", "400", "0.2%", "0.43", "0.153"),
+        ("soft", "321", "391", "323", "1237", "400", "0.20%", "0.43", "0.153"),
         ("stiff", "384", "525", "323", "1237", "unknown", "unknown", "0.43", "unknown"),
     ]
     assert len(forces.head) == len(forces.rows[0])
@@ -496,3 +498,19 @@ def test_the_page_tells_what_it_was_made_of_as_sha256sum_does(tmp_path: Path) ->
     assert digest_of_files(by_name) == of_cine
     (said,) = provenance({}, Settings(), tmp_path / "manifest.json").tables[1].rows
     assert said == ("all", "default", "")
+
+
+def test_the_page_is_drawn_alike_for_everybody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user's own `matplotlibrc` may turn pictures over, and ask for LaTeX."""
+    seen = []
+
+    def look(_: object) -> None:
+        seen.append([matplotlib.rcParams[name] for name in ("image.origin", "text.usetex")])
+        raise StageError("enough")
+
+    monkeypatch.setattr(report_stage, "read_cine", look)
+    with matplotlib.rc_context({"image.origin": "lower", "text.usetex": True}):
+        with pytest.raises(StageError, match="enough"):
+            report_stage.run(SimpleNamespace(products=Path("nowhere")))
+        assert matplotlib.rcParams["image.origin"] == "lower"
+    assert seen == [["upper", False]]

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 def write_preview(path: Path, study: SyntheticStudy) -> None:
     """Write the page; its folder is made if missing."""
     from data_synth.preview.page import render_page
+    from data_synth.preview.style import own_style
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render_page(study), encoding="utf-8")
+    with own_style():
+        path.write_text(render_page(study), encoding="utf-8")

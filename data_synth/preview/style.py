@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
@@ -24,6 +25,14 @@ STYLES: dict[str, tuple[str, Any]] = {
 }
 QUALITY = 82
 """Of lossy WebP: no difference from lossless is seen at this size."""
+
+
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Figures that are made within do not depend on the user's own ``matplotlibrc``."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        yield
 
 
 def edged(width: float) -> list[AbstractPathEffect]:

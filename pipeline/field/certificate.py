@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.errors import StageError
 from pipeline.exact import ExactSurface, points_about
 from pipeline.field.fixture import Bounds, Fixture
-from pipeline.field.motion import BeatingSurface, Motion, halfway
+from pipeline.field.motion import BeatingSurface, Motion, halfway, is_gap
 from pipeline.field.reader import ForceField
 from pipeline.field.stiffness import STEP_MM, field_rates_n_per_m
 from pipeline.field.threads import processors
@@ -207,13 +207,15 @@ def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[s
     """How far the field's surface is, halfway between phases, from the smoothly moving one.
 
     The measure is the interpolated distance at all vertices, which follow their own periodic spline
-    in time, and in the middles of the triangles; None where vertices do not correspond, or phases
-    are too few for a spline.
+    in time, and in the middles of the triangles; beside it by about how much that spline may be
+    off. None where vertices do not correspond, or phases are too few for a spline.
     """
     motion = Motion.of(moving)
     if motion is None:
-        return {"drift_max_mm": None, "drift_p99_mm": None, "drift_max_mm_by_phase": None}
+        names = ("drift_max_mm", "drift_p99_mm", "motion_unsure_p99_mm", "drift_max_mm_by_phase")
+        return dict.fromkeys(names)
     off = []
+    unsure_mm = motion.unsure_mm()[~is_gap(np.diff(volume.phases, append=volume.phases[0] + 1))]
     for moment in halfway(volume.phases).tolist():
         surface = motion.at(moment)
         middles_mm = surface.vertices_mm[surface.triangles].mean(axis=1)
@@ -222,6 +224,7 @@ def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[s
     return {
         "drift_max_mm": float(np.max([one.max() for one in off])),
         "drift_p99_mm": float(np.percentile(np.concatenate(off), 99)),
+        "motion_unsure_p99_mm": float(np.percentile(unsure_mm, 99)),
         "drift_max_mm_by_phase": [float(one.max()) for one in off],
     }
 

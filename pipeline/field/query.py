@@ -105,10 +105,10 @@ def stiffness_words(figures: Mapping[str, Any]) -> str:
 
     >>> found = {"stiffness_n_per_m": 321.4, "stiffness_measured_n_per_m": 391.2}
     >>> stiffness_words({**found, "stiffness_limit_n_per_m": 400.0})
-    'stiffness 321 N/m by its law, at most 391 as measured; the device renders 400'
+    'stiffness 321 N/m by its law, at most 391 along the force as measured; the device renders 400'
     """
     measured, limit = figures["stiffness_measured_n_per_m"], figures["stiffness_limit_n_per_m"]
-    found = "" if measured is None else f", at most {measured:.0f} as measured"
+    found = "" if measured is None else f", at most {measured:.0f} along the force as measured"
     most = "" if limit is None else f"; the device renders {limit:.0f}"
     if limit is not None and measured is not None and measured > limit:
         most += ", less than measured"

@@ -8,7 +8,9 @@ Numerical Methods for Least Squares Problems, SIAM 1996), scaled by the diagonal
 the points that are still too far off get more weight, in proportion to it: so Lawson's
 algorithm goes from least squares to the least maximum (Lawson, Contributions to the theory of
 linear least maximum approximations, UCLA 1961). Points are asked for at three moments a stored
-phase, where vertices follow their own spline in time.
+phase, where vertices follow their own spline in time. Between phases a point weighs by the inverse
+of its variance: of few phases nobody knows where the surface was, and a zero that is bent to a
+guess bends the distance about it.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ DAMPING = 0.06
 """Weight of a coefficient's squared change beside the squared distance of one point."""
 NEAR_ENOUGH = 0.035
 """A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
-weight: to bring it nearer still would cost the gradient about it more than it is worth."""
+weight: to bring it nearer still would cost the gradient about it more than it is worth. Of one
+whose own place is unsure that is added, as independent errors are."""
 MOST_WEIGHT = 500.0
 MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
@@ -60,6 +63,9 @@ class _Moment:
 
     weights: Float32
     """``(3,)``: of the phases before, at and after it."""
+
+    near_enough_mm: Float32
+    """``(point,)``: one that is nearer to the spline's zero gets no more weight."""
 
 
 def fit_to_surface(
@@ -86,29 +92,48 @@ def fit_to_surface(
     """
     if rounds == 0:
         return 0.0
-    places = [(phase, _inside(points, grid)) for phase, points in _places(moving, phases, grid)]
+    places = [one.inside(grid) for one in _places(moving, phases, grid)]
     # Between phases that lie close together a spline may carry all points out of the grid.
-    places = [(phase, points_mm) for phase, points_mm in places if len(points_mm)]
-    low, high = _box([points_mm for _, points_mm in places], grid)
+    places = [one for one in places if len(one.points_mm)]
+    low, high = _box([one.points_mm for one in places], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     line = timeline(phases)
     moments = []
-    for phase, points_mm in places:
-        interval, weights = phase_weights(line, phase)
-        nodes = (points_mm - grid.origin_mm) / np.array(grid.spacing_mm) - low
-        moments.append(
-            _Moment(nodes.astype(np.float32), interval, np.array(weights, dtype=np.float32))
-        )
+    step_mm = min(grid.spacing_mm)
+    for one in places:
+        interval, weights = phase_weights(line, one.phase)
+        nodes = (one.points_mm - grid.origin_mm) / np.array(grid.spacing_mm) - low
+        near_enough_mm = np.maximum(NEAR_ENOUGH * step_mm, one.unsure_mm).astype(np.float32)
+        parts = nodes.astype(np.float32), interval, np.array(weights, dtype=np.float32)
+        moments.append(_Moment(*parts, near_enough_mm))
     del places
     near = np.stack([one[box] for one in splines])
-    change = _Fit(near, moments, min(grid.spacing_mm)).after(rounds)
-    for one, part in zip(splines, change, strict=True):
-        one[box] += part
+    change = _Fit(near, moments, step_mm).after(rounds)
+    for spline, part in zip(splines, change, strict=True):
+        spline[box] += part
     return float(np.abs(change).max())
 
 
-def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[tuple[float, Float]]:
-    """Moments and ``(n, 3)`` points: those of stored phases, and where vertices correspond the
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Points of the surface at one phase."""
+
+    phase: float
+    points_mm: Float
+    """``(n, 3)``."""
+
+    unsure_mm: Float
+    """``(n,)``: by about how much each may be off."""
+
+    def inside(self, grid: Grid) -> _Places:
+        """Those whose three nodes an axis are all in the grid."""
+        nodes = (self.points_mm - grid.origin_mm) / np.array(grid.spacing_mm)
+        held = ((nodes >= 0.5) & (nodes < np.array(grid.shape[::-1]) - 1.5)).all(1)
+        return _Places(self.phase, self.points_mm[held], self.unsure_mm[held])
+
+
+def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Places]:
+    """Points at some moments: at stored phases, and where vertices correspond the
     same material points between them, but in no gap: what a spline of few phases cannot follow
     there, it would make up for at the phases beside it."""
     step_mm = min(grid.spacing_mm)
@@ -116,13 +141,22 @@ def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[tuple
     if motion is None:
         for index, phase in enumerate(phases.tolist()):
             surface = moving.at(index)
-            yield phase, _carried(surface, *_spread_over(surface, step_mm))
+            points_mm = _carried(surface.vertices_mm, *_spread_over(surface, step_mm))
+            yield _Places(phase, points_mm, np.zeros(len(points_mm)))
         return
     corners, shares = _spread_over(moving.at(0), step_mm)
     moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
     moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
-    for phase in moments[np.isfinite(moments)].tolist():
-        yield phase, _carried(motion.at(phase), corners, shares)
+    for (stored, *later), unsure_mm in zip(moments.tolist(), motion.unsure_mm(), strict=True):
+        yield _Places(
+            stored, _carried(motion.at(stored).vertices_mm, corners, shares), np.zeros(len(corners))
+        )
+        around_mm = _carried(unsure_mm, corners, shares)
+        for phase in later:
+            if np.isfinite(phase):
+                yield _Places(
+                    phase, _carried(motion.at(phase).vertices_mm, corners, shares), around_mm
+                )
 
 
 def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
@@ -143,18 +177,10 @@ def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
     return np.concatenate([triangles[chosen], *some]), np.concatenate(shares)
 
 
-def _carried(surface: Surface, corners: Integer, shares: Float) -> Float:
-    """Where material points are: ``(n, 3)``, mm."""
+def _carried(values: Float, corners: Integer, shares: Float) -> Float:
+    """What vertices have, ``(vertex, ...)``, at material points ``(n, ...)``."""
     return np.asarray(
-        sum(shares[:, [k]] * surface.vertices_mm[corners[:, k]] for k in range(3)), dtype=float
-    )
-
-
-def _inside(points_mm: Float, grid: Grid) -> Float:
-    """Those points whose three nodes an axis are all in the grid."""
-    nodes = (points_mm - grid.origin_mm) / np.array(grid.spacing_mm)
-    return np.asarray(
-        points_mm[((nodes >= 0.5) & (nodes < np.array(grid.shape[::-1]) - 1.5)).all(1)]
+        sum((shares[:, k] * values[corners[:, k]].T).T for k in range(3)), dtype=float
     )
 
 
@@ -179,13 +205,13 @@ class _Fit:
         self, coefficients: Float32, moments: Sequence[_Moment], spacing_mm: float
     ) -> None:
         self._moments = moments
-        self._near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
         self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
         self._layer = np.empty_like(coefficients[0])
         self._change = np.zeros_like(coefficients)
         self._before = [-one for one in self._values(coefficients)]
         self._off = [one.copy() for one in self._before]
-        self._weights = [np.ones_like(one) for one in self._off]
+        near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
+        self._weights = [np.square(near_enough_mm / one.near_enough_mm) for one in moments]
 
     def after(self, rounds: int) -> Float32:
         """The change after some rounds of reweighted least squares."""
@@ -206,8 +232,8 @@ class _Fit:
 
     def _weigh(self) -> None:
         """More weight to points that are too far off."""
-        for weight, off in zip(self._weights, self._off, strict=True):
-            weight *= np.maximum(np.abs(off) / self._near_enough_mm, np.float32(1))
+        for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
+            weight *= np.maximum(np.abs(off) / one.near_enough_mm, np.float32(1))
             np.minimum(weight, np.float32(MOST_WEIGHT), out=weight)
 
     def _least_squares(self) -> None:

@@ -20,6 +20,7 @@ from pipeline.paper.torus_tool import torus_tool
 from pipeline.progress import Progress
 from pipeline.publish import publishing
 from pipeline.report.page import Section, filled
+from pipeline.report.style import own_style
 
 Make = Callable[[Subject, int, int, Progress], Section]
 
@@ -131,6 +132,7 @@ class Beside:
     command: str
 
 
+@own_style()
 def write_paper(out: Path, options: PaperOptions, watcher: Watcher) -> Path:
     """Write ``index.html``, and every figure and table as a file of its own, into ``out``.
 

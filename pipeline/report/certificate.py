@@ -13,7 +13,7 @@ COLUMNS = {
     "stiffness_any_direction_p99_n_per_m": ("in any direction, p99, N/m", "{:.0f}"),
     "stiffness_any_direction_max_n_per_m": ("the most, N/m", "{:.0f}"),
     "stiffness_limit_n_per_m": ("device renders, N/m", "{:.0f}"),
-    "beyond_limit_share": ("places beyond that", "{:.1%}"),
+    "beyond_limit_share": ("places beyond that", "{:.2%}"),
     "force_step_max_n_per_0_1_mm": ("most over 0.1 mm, N", "{:.2f}"),
     "force_change_max_n_per_ms": ("most over 1 ms, N", "{:.3f}"),
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
@@ -11,6 +13,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
+
+
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Figures that are made and written within look alike for everybody: by a user's own
+    ``matplotlibrc`` pictures may stand upside down under their letters, or ask for LaTeX."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        yield
 
 
 def as_svg(figure: Figure) -> bytes:

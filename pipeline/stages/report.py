@@ -24,7 +24,7 @@ from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
 from pipeline.report.provenance import provenance
 from pipeline.report.registered import registration, registration_notes
-from pipeline.report.style import as_png, as_svg
+from pipeline.report.style import as_png, as_svg, own_style
 from pipeline.summary import (
     by_reason,
     cut_off_by,
@@ -41,15 +41,19 @@ FIELD_TOLD = (
     "distance every 5 mm (the surface is bold) and arrows of force. Of the certificate: p99 is "
     "what 99 places in 100 keep under; sign errors are places taken for the wrong side; the "
     "gradient error is the length by which the gradient differs from the true one, which is 1 "
-    "long; drift is how far the surface lies off halfway between two phases (unknown where there "
-    "are two phases only: how it goes from one to the other is then a guess); the band is what "
+    "long; drift is how far the field lies, halfway between two phases, off a smooth curve through "
+    "the surfaces of all; motion unsure is by about how much the heart itself may lie off that "
+    "curve, as far as the phases tell when one is left out: the fewer there are, the more (both "
+    "are unknown where there are two phases only: how the surface goes from one to the other is "
+    "then a guess); the band is what "
     "lies within it of the surface. A device has to render the fixture's stiffness, which is "
     "below its limit; what is measured exceeds it at the share of places that is told: beside a "
     "medial axis, where two parts of the surface are equally near and the force changes with "
-    "place as fast as the grid's spacing allows."
+    "place as fast as the grid's spacing allows, and, of few phases, near walls that move fast."
 )
 
 
+@own_style()
 def run(job: Job) -> dict[str, Any]:
     """Write ``index.html``, which needs no other file."""
     cine = read_cine(job.products / "ingest")
