@@ -68,8 +68,13 @@ def _require_text(folder: Path) -> None:
     try:
         str(folder).encode()
     except UnicodeEncodeError as error:
-        told = os.fsencode(folder).decode(errors="backslashreplace")
-        raise SynthError(f"{told}: is no UTF-8 text; choose another folder") from error
+        name = os.fsencode(folder)
+        try:
+            wrong = f"{name.decode()}: this shell's locale lacks letters of it; set LC_ALL=C.UTF-8"
+        except UnicodeDecodeError:
+            told = name.decode(errors="backslashreplace")
+            wrong = f"{told}: is no UTF-8 text; choose another folder"
+        raise SynthError(wrong) from error
 
 
 def require_free(folder: Path, overwrite: bool) -> None:

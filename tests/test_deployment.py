@@ -267,6 +267,8 @@ def test_names_that_are_no_text_are_refused_before_a_library_ends_the_program(tm
     with pytest.raises(SynthError, match=r"L.xfctin/new: is no UTF-8 text"):
         write_study(odd / "new", PhantomSettings())
     assert not (odd / "new").exists()
+    with pytest.raises(SynthError, match="locale lacks letters"):
+        write_study(Path(b"caf\xc3\xa9".decode("ascii", "surrogateescape")), PhantomSettings())
 
 
 def locked_once(folder):

@@ -447,7 +447,7 @@ def test_each_fixtures_forces_stand_beside_its_own_law_and_device() -> None:
         {"node_error_near_mm": 0.001, "sign_errors": 0},
     )
     assert forces.rows == [
-        ("soft", "321", "391", "323", "1237", "400", "0.20%", "0.43", "0.153"),
+        ("soft", "321", "391", "323", "1237", "400", "0.19%", "0.43", "0.153"),
         ("stiff", "384", "525", "323", "1237", "unknown", "unknown", "0.43", "unknown"),
     ]
     assert len(forces.head) == len(forces.rows[0])
