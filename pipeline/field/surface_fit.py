@@ -8,9 +8,9 @@ Numerical Methods for Least Squares Problems, SIAM 1996), scaled by the diagonal
 the points that are still too far off get more weight, in proportion to it: so Lawson's
 algorithm goes from least squares to the least maximum (Lawson, Contributions to the theory of
 linear least maximum approximations, UCLA 1961). Points are asked for at three moments a stored
-phase, where vertices follow their own spline in time. Between phases a point weighs by the inverse
-of its variance: of few phases nobody knows where the surface was, and a zero that is bent to a
-guess bends the distance about it.
+phase, where vertices follow their own spline in time. Where phases are few nobody knows where the
+surface was between them, and a zero that is bent to a guess bends the distance about it: such a
+point weighs by the inverse of its variance.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ NEAR_ENOUGH = 0.035
 """A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
 weight: to bring it nearer still would cost the gradient about it more than it is worth. Of one
 whose own place is unsure that is added, as independent errors are."""
+FEW_PHASES = 16
+"""With fewer, what the vertices' spline does not know costs the gradient more than its zero gains;
+with more it follows the heart as closely as the field can."""
 MOST_WEIGHT = 500.0
 MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
@@ -147,7 +150,8 @@ def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Plac
     corners, shares = _spread_over(moving.at(0), step_mm)
     moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
     moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
-    for (stored, *later), unsure_mm in zip(moments.tolist(), motion.unsure_mm(), strict=True):
+    unsure_of_each_mm = motion.unsure_mm() * (len(phases) < FEW_PHASES)
+    for (stored, *later), unsure_mm in zip(moments.tolist(), unsure_of_each_mm, strict=True):
         yield _Places(
             stored, _carried(motion.at(stored).vertices_mm, corners, shares), np.zeros(len(corners))
         )
