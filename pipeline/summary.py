@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from pipeline.doubts import doubts
+from pipeline.doubts import doubts, few_phases
 
 LARGEST_DELAY_S = 0.1
 """A scanner stamps its frames later than they are by tens of milliseconds."""
@@ -72,6 +72,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
         *[("cut off", text) for text in cut_sideways_by(segment.get("cut_sideways", {}), ingest)],
         *[("doubtful", text) for text in doubts(segment, figures.get("surface", {}))],
+        *[("doubtful", text) for text in few_phases(figures.get("bake", {}).get("accuracy", {}))],
         *_left_out(figures),
     ]
 

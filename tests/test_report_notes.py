@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config import Settings
-from pipeline.doubts import doubts
+from pipeline.doubts import doubts, few_phases
 from pipeline.geometry import MovingSurface
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.view import AS_THE_FILE_SAYS
@@ -80,7 +80,7 @@ def opening(
         },
         "ingest": {"remarks": [], "interpolated_slices": [3] if doubtful else [], "phases": 9},
         "surface": {"left_out": {}},
-        "bake": {"left_out": {}},
+        "bake": {"accuracy": {}, "left_out": {}},
         "register": {"verdict": verdict, "reason": "few frames", "remarks": []},
     }
     made = {"register": verdict is not None, "evaluate": truth}
@@ -285,3 +285,17 @@ def test_figures_of_a_ventricle_that_the_stack_cuts_off_say_so() -> None:
     left, right = _of_whole_ventricles(rows, {"left ventricle": {0: 2}, "aorta": {7: 2}})
     assert left == ("LV mass", "45 g (of what the stack shows)")
     assert right == rows[1]
+
+
+def test_phases_too_few_to_tell_where_walls_are_between_them_are_told():
+    assert few_phases({"motion_unsure_p99_mm": 0.3}) == []
+    # As of fields of surfaces of one's own that do not correspond, and of older ones.
+    assert few_phases({}) == []
+    [said] = few_phases({"motion_unsure_p99_mm": None})
+    assert "nobody knows" in said
+    [said] = few_phases({"motion_unsure_p99_mm": 1.26})
+    assert "walls may lie 1.3 mm" in said
+    stages = {"bake": {"status": "done", "figures": {"accuracy": {"motion_unsure_p99_mm": 1.26}}}}
+    assert ("doubtful", said) in remarks(stages)
+    stages["bake"]["status"] = "stale"
+    assert remarks(stages) == []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline import INTENDED_USE, __version__
-from pipeline.doubts import doubts
+from pipeline.doubts import doubts, few_phases
 from pipeline.field.fixture import Fixture
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.reader import ForceField
@@ -236,6 +236,7 @@ def _warnings(job: Job) -> list[str]:
         named = ", ".join(str(number) for number in missing)
         notes.append(f"Not recorded or spoilt, so drawn between their neighbours: slices {named}.")
     told = doubts(job.figures("segment"), job.figures("surface"))
+    told += few_phases(job.figures("bake")["accuracy"])
     notes += [f"Doubtful {text}." for text in told]
     for text in cut_off_by(_cut_off(job, of_field=True), ingest):
         notes.append(f"Cut off by the stack's end: {text}.")
