@@ -150,7 +150,9 @@ def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Plac
     corners, shares = _spread_over(moving.at(0), step_mm)
     moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
     moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
-    unsure_of_each_mm = motion.unsure_mm() * (len(phases) < FEW_PHASES)
+    unsure_of_each_mm = np.zeros(motion.places_mm.shape[:2])
+    if len(phases) < FEW_PHASES:
+        unsure_of_each_mm = motion.unsure_mm()
     for (stored, *later), unsure_mm in zip(moments.tolist(), unsure_of_each_mm, strict=True):
         yield _Places(
             stored, _carried(motion.at(stored).vertices_mm, corners, shares), np.zeros(len(corners))
