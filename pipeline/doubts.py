@@ -39,7 +39,7 @@ LEAST_EJECTION = 0.15
 
 UNSURE_MM = 1.0
 """How unsure the walls' places between phases may be, untold: surfaces found in a study of 25
-phases were to 0.3 mm, in one of 10 to 0.8 mm, in one of 4 to 1.5 mm."""
+phases were to 0.3 mm, in one of 10 to 0.8 mm, in one of 6 to 1.5 mm."""
 
 HARDLY = 0.25
 """Of the other slices' swing: a slice that swings less hardly moves."""

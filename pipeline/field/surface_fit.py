@@ -40,8 +40,8 @@ DAMPING = 0.06
 """Weight of a coefficient's squared change beside the squared distance of one point."""
 NEAR_ENOUGH = 0.035
 """A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
-weight: to bring it nearer still would cost the gradient about it more than it is worth. Of one
-whose own place is unsure that is added, as independent errors are."""
+weight: to bring it nearer still would cost the gradient about it more than it is worth. One
+whose own place is less sure than that need come no nearer than it is sure."""
 FEW_PHASES = 16
 """With fewer, what the vertices' spline does not know costs the gradient more than its zero gains;
 with more it follows the heart as closely as the field can."""
