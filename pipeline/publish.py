@@ -21,6 +21,7 @@ from pipeline.errors import InputError
 from pipeline.regular_files import require_text_name
 
 PARTIAL = ".partial-"
+OLD = "old-"
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 REFUSED = {
@@ -90,7 +91,7 @@ def readable_write_errors(target: Path) -> Iterator[None]:
 
 def _swap(partial: Path, target: Path) -> None:
     """Put ``partial`` in the place of ``target``; a folder cannot be renamed over another."""
-    old = target.with_name(f".{target.name}{PARTIAL}old-{os.getpid()}")
+    old = target.with_name(f".{target.name}{PARTIAL}{OLD}{os.getpid()}")
     # In a container every run may have this number, and one may have been killed right here.
     remove(old)
     with _held(target):
@@ -162,9 +163,19 @@ def _lives(pid: int) -> bool:
 
 
 def remove_partials(folder: Path, name: str = "*") -> None:
-    """Clear away what killed runs left unfinished, of one product or of all."""
+    """Clear away what killed runs left unfinished, of one product or of all.
+
+    A product that one had put aside, and nothing in its place yet, goes back there.
+    """
     for path in folder.glob(f".{name if name == '*' else escape(name)}{PARTIAL}*"):
-        if not _in_use(path):
+        if _in_use(path):
+            continue
+        product, _, rest = path.name[1:].rpartition(PARTIAL)
+        target = path.with_name(product)
+        if rest.startswith(OLD) and not os.path.lexists(target):
+            # It was killed between the two renames of a swap: nothing else of the product stands.
+            path.rename(target)
+        else:
             remove(path)
 
 

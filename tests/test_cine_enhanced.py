@@ -81,6 +81,13 @@ def test_the_heart_rate_goes_before_the_interval_that_was_asked_for(tmp_path: Pa
     assert_is_the_stack(read_dicom_cine(tmp_path))
 
 
+def test_a_beat_of_a_frame_goes_before_that_of_the_whole_object(tmp_path: Path) -> None:
+    data = enhanced_object(ALL_FRAMES)
+    data.RRIntervalTimeNominal = 1.5 * RR_MS
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
 def test_enhanced_frames_without_description_are_refused(tmp_path: Path) -> None:
     data = enhanced_object(ALL_FRAMES)
     del data.PerFrameFunctionalGroupsSequence[-1]

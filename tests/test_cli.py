@@ -347,7 +347,8 @@ def test_the_summary_says_what_must_be_known_before_a_field_is_used(tmp_path: Pa
         (0.60, 0.6, True),
         (0.16, 0.6, True),
         (0.96, 0.6, True),
-        (0.16, 0.1, False),
+        (0.16, 0.17, True),
+        (0.16, 0.14, False),
     ],
 )
 def test_the_summary_doubts_phases_that_do_not_begin_at_the_r_peak(

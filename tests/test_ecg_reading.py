@@ -423,8 +423,17 @@ def test_a_csv_of_windows_is_told_by_its_micro_sign(tmp_path):
 )
 def test_what_a_line_of_a_csv_lacks_is_told(tmp_path, line, told):
     path = write_csv(tmp_path / "ecg.csv", header=f"time_s,I,II\n{line}")
-    with pytest.raises(InputError, match=rf"line 2: needs 3 numbers.*; {told}"):
+    with pytest.raises(InputError, match=rf"line 2: needs 3 finite numbers.*; {told}"):
         read_ecg(path)
+
+
+@pytest.mark.parametrize("header", ["Patient: {};13.07.1941", "{},I", "time_s,I\n0,0.1\n0.1,{}"])
+def test_a_patient_named_in_a_csv_is_not_repeated(tmp_path, header):
+    """Refusals are kept in run.json and in the table of a batch."""
+    (tmp_path / "ecg.csv").write_text(header.format("Hildegard") + "\n0.2,1\n0.3,1\n")
+    with pytest.raises(InputError, match=r"ecg\.csv") as refusal:
+        read_ecg(tmp_path / "ecg.csv")
+    assert "Hildegard" not in str(refusal.value)
 
 
 def test_csv_in_utf_16_is_refused_with_the_remedy(tmp_path):

@@ -336,6 +336,18 @@ def test_a_damaged_field_is_named_not_the_question(path, tmp_path, capsys, value
     assert "is damaged" in capsys.readouterr().err
 
 
+def test_a_field_in_memory_is_what_it_was_whatever_becomes_of_its_files(path, tmp_path, field):
+    folder = shutil.copytree(path, tmp_path / "f.zarr")
+    kept, mapped = ForceField.open(folder, in_memory=True), ForceField.open(folder)
+    points = np.array([(14.0, 2.0, 1.0), (3.0, -9.0, 20.0)])
+    expected = field.force_n(points, PHASES[1])
+    for chunk in folder.glob("spline/*/c/*/0/0/0"):
+        np.memmap(chunk, "<f4", "r+")[:] = 0
+    assert (mapped.force_n(points, PHASES[1]) != expected).any()
+    assert (kept.force_n(points, PHASES[1]) == expected).all()
+    assert kept.force_at(*points[0], PHASES[1]) == field.force_at(*points[0], PHASES[1])
+
+
 def test_numbers_of_any_type_are_answered_without_compiling_anew(field):
     """A compilation takes seconds, in which a hand would be held by a force of long ago."""
     expected = field.force_at(14.0, 2.0, 1.0, 0.0), field.distance_at(14.0, 2.0, 1.0, 0.0)

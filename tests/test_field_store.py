@@ -181,8 +181,9 @@ def test_added_files_are_found(copy):
         (lambda b: b.update(frame="RAS"), r"beatfield\.frame"),
         (lambda b: b.update(phases=[0.5, 0.1]), "phases must rise"),
         (lambda b: b.update(phases=[0.0, 0.0004]), "shares of a cycle, not seconds"),
-        (lambda b: b.update(surprise=1), r"beatfield\.surprise: Extra inputs"),
-        (lambda b: b.pop("source"), r"beatfield\.source: Field required"),
+        (lambda b: b.update(surprise=1), r"beatfield\.surprise: Extra inputs.* another version"),
+        (lambda b: b.pop("source"), r"beatfield\.source: Field required.* another version"),
+        (lambda b: b.update(format_version=2), r"format_version: .* another version of beatfield"),
         (lambda b: b["grid"].update(shape_zyx=[3, 3, 3]), r"shape is .* needed \[5, 3, 3, 3\]"),
         (
             lambda b: b["fixtures"]["guide"].update(delta_mm=9.0),

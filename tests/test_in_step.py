@@ -97,6 +97,23 @@ def test_two_beats_in_the_time_of_one_are_no_slice_that_hardly_moves():
     found = told(usual, usual, np.tile(usual[::2], 2), usual)
     assert found[2]["swing"] == pytest.approx(1, abs=0.1)
     assert abs(found[2]["in_step"]) < 0.25
+    assert "late" not in found[2]
+
+
+def test_a_slice_that_swings_by_a_tenth_is_not_called_late():
+    """Noise decides what so little follows."""
+    usual = areas()
+    found = told(usual, areas(share=0.05, late=0.3), usual, usual)
+    assert set(found) == {1}
+    assert "late" not in found[1]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_of_three_slices_the_one_is_told(place):
+    usual = areas()
+    slices = [usual] * 3
+    slices[place] = areas(late=0.25)
+    assert set(told(*slices)) == {place}
 
 
 def test_outlines_that_are_a_little_off_tell_nothing():

@@ -30,6 +30,7 @@ from pipeline.registration.uncertainty import (
     in_radians,
     motion_between,
     sandwich,
+    slopes_at,
 )
 from pipeline.registration.verdict import Evidence, judge
 
@@ -62,6 +63,8 @@ def test_derivatives_of_a_quadratic_are_exact():
     found = curvature_at(quadratic_losses(optima))
     np.testing.assert_allclose(found.bending, 9 * BENDING, rtol=1e-9)
     np.testing.assert_allclose(found.slopes, -optima @ BENDING, rtol=1e-9, atol=1e-9)
+    slopes = slopes_at(quadratic_losses(optima))
+    np.testing.assert_allclose(slopes, -optima @ BENDING, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("persistence", [0.0, 0.6])
@@ -197,6 +200,24 @@ def test_covariance_in_radians_is_divided_by_the_lever():
 class TestVerdict:
     def test_sound_evidence_is_good(self):
         assert judge(Evidence(**SOUND), RegisterSettings()).grade == "good"
+
+    @pytest.mark.parametrize(
+        "change", [{"shift_mm": 29.0}, {"turn_deg": 29.0}, {"rival": 0.7}, {"confidence": 2.1}]
+    )
+    def test_what_lies_within_the_limits_is_good(self, change):
+        """The search takes starts of 20 mm and 20 degrees, and an optimum may lie beyond."""
+        assert judge(Evidence(**(SOUND | change)), RegisterSettings()).grade == "good"
+
+    def test_who_asks_for_less_confidence_has_no_failure_without_a_reason(self):
+        settings = RegisterSettings(min_confidence=0.5)
+        assert judge(Evidence(**(SOUND | {"confidence": 0.9})), settings).grade == "good"
+
+    def test_a_size_is_named_as_the_cause_of_a_failure_but_where_frames_fit_better_elsewhere(self):
+        wrong = SOUND | {"expected_mm": 9.0, "size": Size(0.08, 0.1)}
+        for confidence, named in ((1.7, True), (0.9, False)):
+            said = judge(Evidence(**(wrong | {"confidence": confidence})), RegisterSettings())
+            assert said.grade == "failed"
+            assert ("8% larger" in said.reason) == named
 
     @pytest.mark.parametrize(
         ("change", "reason"),

@@ -369,6 +369,29 @@ def test_what_was_killed_within_a_swap_is_in_nobodys_way(tmp_path: Path) -> None
     assert [one.name for one in tmp_path.iterdir()] == ["stage"]
 
 
+def test_killed_between_the_renames_of_a_swap_costs_no_product(tmp_path: Path) -> None:
+    """The next run puts the old one back before it begins, and may then fail."""
+    script = (
+        "import os, signal, sys; from pathlib import Path\n"
+        "from pipeline.publish import publishing\n"
+        "target, rename = Path(sys.argv[1]), Path.rename\n"
+        "def dying(self, other):\n"
+        "    rename(self, other)\n"
+        "    if self == target: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "for content in ('old', 'new'):\n"
+        "    with publishing(target) as folder: (folder / 'text').write_text(content)\n"
+        "    Path.rename = dying\n"
+    )
+    target = tmp_path / "stage"
+    ended = subprocess.run([sys.executable, "-c", script, str(target)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert not target.exists()
+    with pytest.raises(RuntimeError), publishing(target):
+        raise RuntimeError
+    assert (target / "text").read_text() == "old"
+    assert [one.name for one in tmp_path.iterdir()] == ["stage"]
+
+
 @pytest.mark.parametrize(
     ("error", "told"),
     [(OSError(errno.EACCES, "Permission denied", "x"), InputError), (KeyboardInterrupt(), None)],

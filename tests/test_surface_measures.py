@@ -141,6 +141,20 @@ def test_a_dent_shows_in_its_own_segment(direction, name):
     assert min(segments, key=lambda one: segments[one][0]) == name
 
 
+def test_where_a_patient_lies_changes_nothing(table):
+    """The vectors to the scanner's centre are as long as a patient's are: no share of a height."""
+    shift_mm = np.array([40.0, -120.0, 300.0])
+    far = {
+        name: MovingSurface(one.vertices_mm + shift_mm, one.triangles, one.phases)
+        for name, one in SURFACES.items()
+    }
+    # Values are rounded to 0.01.
+    found, expected = measures(far)["lv_wall_thickness_mm"], table["lv_wall_thickness_mm"]
+    assert list(found["segments"]) == list(expected["segments"])
+    for name, curve in expected["segments"].items():
+        np.testing.assert_allclose(found["segments"][name], curve, atol=0.011)
+
+
 def test_without_a_right_ventricle_segments_are_levels():
     left = {name: one for name, one in SURFACES.items() if name != "rv_endocardium"}
     found = measures(left)

@@ -61,7 +61,8 @@ def main(words: list[str]) -> int:
     try:
         # Opening reads no values: a damaged one would be a wrong force without a word.
         verify_field(Path(path))
-        field, tip_mm = ForceField.open(path), (x_mm, y_mm, z_mm)
+        # From memory: no question waits for a disk, or ends with a file that somebody cuts.
+        field, tip_mm = ForceField.open(path, in_memory=True), (x_mm, y_mm, z_mm)
         if not field.contains([tip_mm])[0]:
             raise InputError(f"{path}: its grid does not hold the point; give one near the heart")
         rows = serve(field, read_ecg(Path(record), gaps=True), tip_mm)

@@ -101,7 +101,10 @@ def read_metadata(path: Path) -> FieldMetadata:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
-        raise InputError(f"{source}: beatfield.{place}: {first['msg']}") from error
+        other = place == "format_version" or first["type"] in ("missing", "extra_forbidden")
+        remedy = "; of another version of beatfield? bake the field again with this one"
+        said = f"{first['msg']}{remedy if other else ''}"
+        raise InputError(f"{source}: beatfield.{place}: {said}") from error
     except InputError as error:
         raise InputError(f"{source}: beatfield: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:

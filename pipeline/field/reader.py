@@ -74,8 +74,9 @@ class ForceField:
     but says less the farther out they are: ask ``contains``.
     """
 
-    def __init__(self, path: Path, metadata: FieldMetadata) -> None:
+    def __init__(self, path: Path, metadata: FieldMetadata, in_memory: bool = False) -> None:
         self._path = path
+        self._in_memory = in_memory
         self._metadata = metadata
         self._fixtures = MappingProxyType(
             {name: part.fixture() for name, part in metadata.fixtures.items()}
@@ -87,7 +88,7 @@ class ForceField:
         parts = metadata.structures
         self._distances = {name: self._map(part.path) for name, part in parts.items()}
         self._coefficients = {
-            name: [readable_in_fours(phase) for phase in self._map(part.spline)]
+            name: [self._kept(phase) for phase in self._map(part.spline)]
             for name, part in parts.items()
         }
         self._addresses = {
@@ -107,26 +108,37 @@ class ForceField:
         count = len(self._phases)
         return [map_phase(self._path / part, index, self._grid) for index in range(count)]
 
+    def _kept(self, coefficients: Float32) -> Float32:
+        return readable_in_fours(coefficients.copy() if self._in_memory else coefficients)
+
     @classmethod
-    def open(cls, path: Path | str) -> ForceField:
+    def open(cls, path: Path | str, in_memory: bool = False) -> ForceField:
         """Open ``field.zarr``.
+
+        Parameters
+        ----------
+        path
+            The folder.
+        in_memory
+            Copy what questions read, half of the field's size, so that none waits for a disk and
+            a file that is written over or cut later changes no force. Else files are mapped.
 
         Raises
         ------
         InputError
             When it is no complete field, its description or size is wrong, or it was replaced
-            meanwhile. Values are not read; ``beatfield verify`` checks every byte.
+            meanwhile. Values are not compared; ``beatfield verify`` checks every byte.
         """
         path = Path(path).resolve()
         manifest = require_manifest(path)
-        field = cls(path, read_metadata(path))
+        field = cls(path, read_metadata(path), in_memory)
         if require_manifest(path) != manifest:
             raise InputError(f"{path}: was replaced while it was opened; open it again")
         return field
 
-    def __reduce__(self) -> tuple[Callable[[Path], ForceField], tuple[Path]]:
+    def __reduce__(self) -> tuple[Callable[[Path, bool], ForceField], tuple[Path, bool]]:
         """Another process, or a copy, opens the field anew: mapped values stay where they are."""
-        return ForceField.open, (self._path,)
+        return ForceField.open, (self._path, self._in_memory)
 
     @property
     def phases(self) -> Float:

@@ -46,8 +46,8 @@ def read_csv(path: Path) -> tuple[Float, tuple[str, ...], float, float]:
     names = [name.strip() for name in lines[0].split(",")] if lines else []
     if len(names) < 2 or names[0] != "time_s":
         raise InputError(
-            f"{path}: the first row is {names}; it needs time_s and then the name of each lead, "
-            f"separated by commas{_remedy(lines[0] if lines else '')}"
+            f"{path}: the first row, of {len(names)} cells, is no header: it needs time_s and then "
+            f"the name of each lead, separated by commas{_remedy(lines[0] if lines else '')}"
         )
     if len(names) > MOST_COLUMNS:
         raise InputError(
@@ -96,7 +96,7 @@ def _remedy(header: str) -> str:
 
 
 def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
-    """The numbers of one line."""
+    """The numbers of one line; a refusal does not repeat it, for it may name the patient."""
     cells = line.split(",")
     try:
         values = [float(cell) for cell in cells]
@@ -115,9 +115,11 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
         remedy = "write nan where a sample is missing"
     elif "." not in line and len(cells) == 2 * columns:
         remedy = "decimal commas look like separators: write points"
+    wrong = [place for place, cell in enumerate(cells, 1) if not _is_number(cell)]
+    which = f"; no number is in cell {', '.join(map(str, wrong[:8]))}" if wrong else ""
     raise InputError(
-        f"{path}, line {number}: needs {columns} numbers separated by commas, got {line!r}; "
-        f"{remedy}"
+        f"{path}, line {number}: needs {columns} finite numbers separated by commas, has "
+        f"{len(cells)} cells{which}; {remedy}"
     )
 
 

@@ -272,7 +272,7 @@ const char *bf_text(bf_status status)
     switch (status) {
     case BF_OK: return "done";
     case BF_CANNOT_READ: return "a file is missing or cannot be read";
-    case BF_NOT_A_FIELD: return "no complete field: give the field.zarr that bake wrote, or bake it again";
+    case BF_NOT_A_FIELD: return "no complete field, or of another version: give the field.zarr that bake wrote, or bake it again";
     case BF_WRONG_SIZE: return "a size is wrong: a file's (bake it again), or a batch's or tool's (mend the call)";
     case BF_DAMAGED:
         return "a file is not what the manifest says, or a value is not finite: bake it again";
