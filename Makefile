@@ -30,10 +30,10 @@ endif
 
 # Stages of one study follow each other, and demo studies are made once.
 .NOTPARALLEL:
-.PHONY: help setup demo paper test check lint types bench train batch clean $(STAGES)
+.PHONY: help setup demo paper test test-all check lint types bench train batch clean $(STAGES)
 
 help: ## explain every target
-	@sed -n 's/^\([a-z][a-z |]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{printf "%-10s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z][a-z |-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | awk -F'\t' '{printf "%-10s %s\n", $$1, $$2}'
 	@echo "$(STAGES):"
 	@echo "           one stage, those before it brought up to date: make segment STUDY=... OUT=... CONFIG=..."
 
@@ -57,8 +57,13 @@ paper: $(READY) ## the paper's figures and table, re-run from the demo's field: 
 	test -d $(DEMO_OUT)/patient-0001/bake/field.zarr || $(MAKE) demo STUDY=$(DEMO) OUT=$(DEMO_OUT)
 	$(BIN)/beatfield paper paper --products $(DEMO_OUT)/patient-0001 --study $(DEMO)
 
-test: setup ## run all tests
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
+PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
+
+test: setup ## run the tests
+	$(PYTEST) -m "not slow"
+
+test-all: setup ## run all tests, with those that take a third more time
+	$(PYTEST)
 
 check: lint types test ## all that CI runs: lint, types, test
 

@@ -114,6 +114,7 @@ def test_the_movie_has_every_phase_and_moves(html: str, study: SyntheticStudy) -
     assert changed.mean() > 0.01
 
 
+@pytest.mark.slow
 def test_the_same_study_gives_the_same_page(
     study: SyntheticStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -288,6 +288,7 @@ def write_as_nifti(series: list[Path], path: Path, timing: Path) -> None:
     timing.write_text(json.dumps({"trigger_times_ms": triggers_ms, "rr_ms": rr_ms}))
 
 
+@pytest.mark.slow
 def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(
     work: Path, products: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -149,6 +149,7 @@ class TestThreeSweeps:
         shift_mm = freed.corrections[0].corrected_from_calibrated[:3, 3]
         assert shift_mm @ off[:3, 3] > 0.5 * off[:3, 3] @ off[:3, 3]
 
+    @pytest.mark.slow
     def test_right_calibrations_are_left_so_and_the_pose_is_as_near(self, study, surfaces, points):
         """With corrections the sweeps count alike, whatever their number of frames.
 

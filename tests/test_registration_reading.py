@@ -143,6 +143,7 @@ def test_a_mirror_image_is_read_as_one():
     assert mirrored(seen).sector is seen.sector
 
 
+@pytest.mark.slow
 def test_both_ways_of_reading_find_the_pose():
     """Within the mean error that is promised at most, from 8 mm and 8 degrees off."""
     recording, surfaces = record(seed=1), moving_surfaces()

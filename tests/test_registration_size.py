@@ -48,7 +48,9 @@ def test_a_heart_of_its_own_size_is_not_in_doubt(recording):
     assert "better with a heart" not in found.reason
 
 
-@pytest.mark.parametrize(("factor", "way"), [(0.93, "larger"), (1.08, "smaller")])
+@pytest.mark.parametrize(
+    ("factor", "way"), [(0.93, "larger"), pytest.param(1.08, "smaller", marks=pytest.mark.slow)]
+)
 def test_a_wrong_size_is_in_doubt_and_expected_as_an_error(recording, factor, way):
     right, wrong = found_with(recording, [1, 1, 1]), found_with(recording, [factor] * 3)
     assert wrong.size.in_doubt

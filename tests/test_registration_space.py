@@ -72,7 +72,9 @@ def timing_of(recording, cycle_rr_s):
 
 
 class TestRegister:
-    @pytest.mark.parametrize("seed", [0, 1, 2])
+    @pytest.mark.parametrize(
+        "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))]
+    )
     def test_pose_is_found_from_15_mm_and_15_degrees_away(self, surfaces, recording, seed):
         start = start_off(recording, 100 + seed, 15, 15)
         told = []

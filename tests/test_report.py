@@ -273,7 +273,9 @@ def measures(phases: int) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("phases", "count"), [(2, 3), (60, 200)])
+@pytest.mark.parametrize(
+    ("phases", "count"), [(2, 3), pytest.param(60, 200, marks=pytest.mark.slow)]
+)
 def test_the_page_of_any_stack_is_small_and_whole(
     phases: int, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -140,7 +140,9 @@ def stripes():
     return still(np.sin(np.arange(128) / 3.0))
 
 
-@pytest.mark.parametrize("what", [brain, head, noise, stripes])
+@pytest.mark.parametrize(
+    "what", [pytest.param(brain, marks=pytest.mark.slow), head, noise, stripes]
+)
 def test_what_is_no_heart_is_refused_with_phase_slice_and_advice(what):
     with pytest.raises(StageError, match=NAMED) as refused:
         segment_cine(what(), QUICK)

@@ -272,6 +272,7 @@ def dice(found, truth, value):
     return 2 * (one & other).sum() / (one.sum() + other.sum())
 
 
+@pytest.mark.slow
 def test_a_lost_header_costs_next_to_nothing(study):
     """Identity matrix, base first, mirrored: labels lie on the images as with a right header."""
     images, truth = study

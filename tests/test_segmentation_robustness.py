@@ -40,7 +40,10 @@ def drawn(seed):
     return render(seed, Scan())
 
 
-@pytest.fixture(scope="module", params=[(1.0, SEEDS), (0.7, SEEDS[1:])], ids=["adults", "children"])
+CHILDREN = pytest.param((0.7, SEEDS[1:]), id="children", marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=[pytest.param((1.0, SEEDS), id="adults"), CHILDREN])
 def people(request):
     """Truth and labels of each person at end-diastole and end-systole; a child is all smaller."""
     size, seeds = request.param

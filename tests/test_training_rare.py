@@ -129,6 +129,7 @@ def test_a_thick_right_wall_is_as_grey_as_the_left_one(monkeypatch):
     assert min(greys[False]) < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rare", [True, False])
 def test_rare_hearts_are_among_what_is_drawn_where_asked_for(monkeypatch, rare):
     asked = {"scarred": [], "bulged": [], "thick_right_walled": []}

@@ -255,6 +255,7 @@ def test_a_shut_tip_is_solid_and_opens_over_the_planes_asked_for(closed, over):
     np.testing.assert_allclose(share, wanted, atol=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ill", [True, False])
 def test_hearts_at_their_worst_are_among_what_is_drawn_where_asked_for(monkeypatch, ill):
     asked, tips = {"far_right_ventricle": [], "shut_tip": [], "ill_shape": []}, []
