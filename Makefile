@@ -62,7 +62,7 @@ PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -q
 test: setup ## run the tests
 	$(PYTEST) -m "not slow"
 
-test-all: setup ## run all tests, with those that take a third more time
+test-all: setup ## run all tests, the slow ones too
 	$(PYTEST)
 
 check: lint types test ## all that CI runs: lint, types, test
