@@ -9,6 +9,11 @@ from a block's middle and radius do (triangle inequality), so the nodes far away
 those nearby. In the end a cube of 2 x 2 x 2 nodes measures one triangle that is near, and then
 those whose boxes are nearer to one of the nodes than what was measured.
 
+Most boxes are sifted out by less. With m the block's middle and h half its sizes, the difference
+above is at the corner where it is least ``|m - p|^2 - |m - q|^2 - 2 h . abs(p - q)``; so where a
+box is farther from m than ``|m - q|^2`` and twice h times the farthest that it reaches from q along
+each axis, it holds no such p. That asks for one distance instead of eight.
+
 Boxes are compared in single precision, sixteen at a time on a wide processor, and have been made
 larger by more than the rounding; triangles are measured in double precision, so the distance that
 comes out is exact.
@@ -31,14 +36,15 @@ from pipeline.geometry import Float, Float32, Integer
 # Nodes along the side of a task of one thread, and of a cube that is measured at once.
 TOP, LEAST = 32, 2
 CORNERS = 8
-# One list for all boxes, for blocks of 32, 16, 8 and 4 nodes a side, and one for a cube.
-DEPTHS = 6
+# One list for all boxes, for blocks of 32, 16, 8 and 4 nodes a side, and one for a cube; behind
+# them one of those that a sieve has let through.
+DEPTHS = SIFTED = 6
 # Lists are worked on in whole vectors; what is behind their end is worked on in vain.
 LANES = 16
 # A block holds boxes whose half length is this part of its own. Twice or half as much is slower.
 BOX_TO_BLOCK = 0.5
-# More than the rounding of a sum of squares in single precision.
-SLACK = np.float32(1 + 1e-6)
+# More than the rounding of a sum of squares in single precision, and of the sum of more.
+SLACK, MORE_SLACK = np.float32(1 + 1e-6), np.float32(1 + 8e-6)
 # Numba compiles a function anew for a literal number; this one is a number like any other.
 NOUGHT = np.int64(0)
 # Minima are vector instructions only where NaN is ruled out. Fused products round less, not more.
@@ -49,7 +55,8 @@ class Work(NamedTuple):
     """What one thread works with."""
 
     lists: Float32
-    """``(depth, 12, n)``: boxes that blocks hold, one list a depth, rows as in the tree."""
+    """``(depth + 1, 12, n)``: boxes that blocks hold, one list a depth, rows as in the tree; and
+    those of one of them that were sifted."""
 
     numbers: npt.NDArray[np.int32]
     """``(depth, n)``: numbers of these boxes in their level of the tree."""
@@ -76,7 +83,7 @@ class Work(NamedTuple):
     """``(3,)``: half its sizes, mm."""
 
     point: Float
-    """``(3,)``: some point of the surface."""
+    """``(3,)``: some point of the surface, near the block."""
 
     nodes: Float
     """``(3, 8)``: the nodes of a cube."""
@@ -105,7 +112,7 @@ def prepared(tree):  # type: ignore[no-untyped-def]
     fan = tree.boxes.shape[2]
     room = (len(tree.triangles) // fan + 1 + fan) * fan + LANES
     return Work(
-        np.empty((DEPTHS, tree.boxes.shape[1], room), np.float32),
+        np.empty((DEPTHS + 1, tree.boxes.shape[1], room), np.float32),
         np.empty((DEPTHS, room), np.int32),
         np.zeros(DEPTHS, np.int64),
         np.zeros(DEPTHS, np.int64),
@@ -174,6 +181,31 @@ def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ig
         bound[k] = least
 
 
+@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+def _least_bounds(lists, depth, count, middle, half, point, bound):  # type: ignore[no-untyped-def]
+    """For each box: no more than `_bounds` tells where its bounds are the ways to ``point``."""
+    zero, two = np.float32(0), np.float32(2)
+    x, y, z = np.float32(middle[0]), np.float32(middle[1]), np.float32(middle[2])
+    hx, hy, hz = np.float32(half[0]), np.float32(half[1]), np.float32(half[2])
+    qx, qy, qz = np.float32(point[0]), np.float32(point[1]), np.float32(point[2])
+    away2 = (x - qx) * (x - qx) + (y - qy) * (y - qy) + (z - qz) * (z - qz)
+    for k in range(count):
+        px, py, pz = lists[depth, 0, k], lists[depth, 1, k], lists[depth, 2, k]
+        dx, dy, dz = px - x, py - y, pz - z
+        ax, ay, az = lists[depth, 3, k], lists[depth, 4, k], lists[depth, 5, k]
+        bx, by, bz = lists[depth, 6, k], lists[depth, 7, k], lists[depth, 8, k]
+        nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        half_u, half_v, half_w = lists[depth, 9, k], lists[depth, 10, k], lists[depth, 11, k]
+        du = max(abs(dx * ax + dy * ay + dz * az) - half_u, zero)
+        dv = max(abs(dx * bx + dy * by + dz * bz) - half_v, zero)
+        dw = max(abs(dx * nx + dy * ny + dz * nz) - half_w, zero)
+        reach_x = abs(px - qx) + abs(ax) * half_u + abs(bx) * half_v + abs(nx) * half_w
+        reach_y = abs(py - qy) + abs(ay) * half_u + abs(by) * half_v + abs(ny) * half_w
+        reach_z = abs(pz - qz) + abs(az) * half_u + abs(bz) * half_v + abs(nz) * half_w
+        most = away2 + two * (hx * reach_x + hy * reach_y + hz * reach_z)
+        bound[k] = du * du + dv * dv + dw * dw - MORE_SLACK * most
+
+
 @njit(nogil=True, cache=True, forceinline=True)
 def _closest_point(triangles, t, point, closest):  # type: ignore[no-untyped-def]
     """The point of triangle t that is closest to another point."""
@@ -231,13 +263,31 @@ def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: igno
 
 
 @njit(nogil=True, cache=True, forceinline=True)
+def _sift(work, depth):  # type: ignore[no-untyped-def]
+    """List the boxes of a list that may come nearer to a corner than the point; how many."""
+    lists, bound, kept, count = work.lists, work.bound, work.kept, work.counts[depth]
+    vectors = -count // LANES * -LANES
+    _least_bounds(lists, depth, vectors, work.middle, work.half, work.point, bound)
+    sifted = 0
+    for k in range(count):
+        kept[sifted] = k
+        sifted += bound[k] <= 0
+    for row in range(lists.shape[1]):
+        for k in range(sifted):
+            lists[SIFTED, row, k] = lists[depth, row, kept[k]]
+    return sifted
+
+
+@njit(nogil=True, cache=True, forceinline=True)
 def _select(work, depth):  # type: ignore[no-untyped-def]
-    """Find the boxes of a list that come nearer to a corner than the bound there; how many."""
+    """Find the boxes of a list that come nearer to a corner than the bound there, which is no
+    farther than the point; how many."""
     count = work.counts[depth]
+    sifted = _sift(work, depth)
     _bounds(
         work.lists,
-        depth,
-        -count // LANES * -LANES,
+        SIFTED,
+        -sifted // LANES * -LANES,
         np.float32(work.middle[0]),
         np.float32(work.middle[1]),
         np.float32(work.middle[2]),
@@ -248,8 +298,8 @@ def _select(work, depth):  # type: ignore[no-untyped-def]
         work.bound,
     )
     used = 0
-    for k in range(count):
-        work.kept[used] = k
+    for k in range(sifted):
+        work.kept[used] = work.kept[k]
         used += work.bound[k] <= 0
     if used == 0:
         # The box that gave the bound is always kept; should it not be, keeping all is right too.
@@ -361,7 +411,8 @@ def _fill_cube(tree, work, axes, depth, corner, out):  # type: ignore[no-untyped
             at = axis[place] if place < len(axis) else 2 * axis[-1] - axis[-2]
             work.nodes[k, lane] = at - tree.centre_mm[k]
     work.best[:] = np.inf
-    work.kept[0] = _closest_middle(work, depth)
+    closest = work.kept[0] = _closest_middle(work, depth)
+    _closest_point(tree.triangles, work.numbers[depth, closest], work.middle, work.point)
     _measure(tree.triangles, work.numbers, depth, work.kept, NOUGHT + 1, work.nodes, work.best)
     for lane in range(CORNERS):
         work.upper[lane] = SLACK * np.float32(work.best[lane])
