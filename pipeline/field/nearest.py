@@ -154,13 +154,26 @@ def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+def _away2(u, v, w, half):  # type: ignore[no-untyped-def]
+    """Squared distance from a box, in its axes."""
+    zero = np.float32(0)
+    du, dv, dw = (
+        max(abs(u) - half[0], zero),
+        max(abs(v) - half[1], zero),
+        max(abs(w) - half[2], zero),
+    )
+    return du * du + dv * dv + dw * dw
+
+
+@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
 def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ignore[no-untyped-def]
     """For each box: the least, over the corners of a block, of its squared distance less the
     bound there.
 
     The block has its middle in (x, y, z) and half its sizes are hx, hy, hz.
     """
-    zero = np.float32(0)
+    upper_0, upper_1, upper_2, upper_3 = upper[0], upper[1], upper[2], upper[3]
+    upper_4, upper_5, upper_6, upper_7 = upper[4], upper[5], upper[6], upper[7]
     for k in range(count):
         dx, dy, dz = lists[depth, 0, k] - x, lists[depth, 1, k] - y, lists[depth, 2, k] - z
         ax, ay, az = lists[depth, 3, k], lists[depth, 4, k], lists[depth, 5, k]
@@ -168,17 +181,26 @@ def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ig
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         u, v = dx * ax + dy * ay + dz * az, dx * bx + dy * by + dz * bz
         w = dx * nx + dy * ny + dz * nz
-        half_u, half_v, half_w = lists[depth, 9, k], lists[depth, 10, k], lists[depth, 11, k]
-        least = np.float32(np.inf)
-        for corner in range(CORNERS):
-            sx = hx if corner & 1 else -hx
-            sy = hy if corner & 2 else -hy
-            sz = hz if corner & 4 else -hz
-            du = max(abs(u - sx * ax - sy * ay - sz * az) - half_u, zero)
-            dv = max(abs(v - sx * bx - sy * by - sz * bz) - half_v, zero)
-            dw = max(abs(w - sx * nx - sy * ny - sz * nz) - half_w, zero)
-            least = min(least, du * du + dv * dv + dw * dw - upper[corner])
-        bound[k] = least
+        half = lists[depth, 9, k], lists[depth, 10, k], lists[depth, 11, k]
+        ax, bx, nx = hx * ax, hx * bx, hx * nx
+        ay, by, ny = hy * ay, hy * by, hy * ny
+        az, bz, nz = hz * az, hz * bz, hz * nz
+        # One after the other, for a loop over corners is taken for the one to make vectors of.
+        least = _away2(u + ax + ay + az, v + bx + by + bz, w + nx + ny + nz, half) - upper_0
+        one = _away2(u - ax + ay + az, v - bx + by + bz, w - nx + ny + nz, half) - upper_1
+        least = min(least, one)
+        one = _away2(u + ax - ay + az, v + bx - by + bz, w + nx - ny + nz, half) - upper_2
+        least = min(least, one)
+        one = _away2(u - ax - ay + az, v - bx - by + bz, w - nx - ny + nz, half) - upper_3
+        least = min(least, one)
+        one = _away2(u + ax + ay - az, v + bx + by - bz, w + nx + ny - nz, half) - upper_4
+        least = min(least, one)
+        one = _away2(u - ax + ay - az, v - bx + by - bz, w - nx + ny - nz, half) - upper_5
+        least = min(least, one)
+        one = _away2(u + ax - ay - az, v + bx - by - bz, w + nx - ny - nz, half) - upper_6
+        least = min(least, one)
+        one = _away2(u - ax - ay - az, v - bx - by - bz, w - nx - ny - nz, half) - upper_7
+        bound[k] = min(least, one)
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
