@@ -328,3 +328,44 @@ def test_a_bubble_beside_the_ventricle_does_not_end_it():
     heart = np.stack([*(ring(5 + k, 12 + k) for k in range(6)), both, bubble, bubble])
     found = cleaned(heart)
     np.testing.assert_array_equal(found[:6], heart[:6])
+
+
+def apart_for_a_phase(piece):
+    """Two planes of a right ventricle aside, whole in 8 phases but one, which shows ``piece``."""
+    heart = np.zeros((8, 5, SIDE, SIDE), np.uint8)
+    for plane, place in enumerate((20, 20, 36, 36, 36)):
+        heart[:, plane][:, np.hypot(X - place, Y - 32) < 10] = RV
+    heart[3] = 0
+    heart[3, 2:, np.hypot(X - 36, Y - 32) < 7] = RV
+    heart[3, :2, piece] = RV
+    value = np.stack([one_hot(one) for one in heart])
+    clean_cycle(value, PIXEL_MM, STEP_MM)
+    return value.argmax(axis=2)[3, :2]
+
+
+@pytest.mark.parametrize(("side", "held"), [(4, False), (5, True)])
+def test_pieces_of_less_than_300_cubic_millimetres_are_not_held(side, held):
+    """Squares on two planes, 7.5 mm3 a pixel: 240 and 375."""
+    piece = np.zeros((SIDE, SIDE), bool)
+    piece[30 : 30 + side, 18 : 18 + side] = True
+    assert (2 * piece.sum() * PIXEL_MM**2 * STEP_MM > 300) == held
+    assert (apart_for_a_phase(piece) == RV).any() == held
+
+
+@pytest.mark.parametrize(("left", "held"), [(3, False), (7, True)])
+def test_a_piece_is_held_where_half_of_it_lies_in_the_bodys_place(left, held):
+    piece = (np.abs(Y - 32) < 5) & (left <= X) & (left + 12 > X)
+    share = (piece & (np.hypot(X - 20, Y - 32) < 10)).sum() / piece.sum()
+    assert 0.3 < share < 0.7
+    assert (share > 0.5) == held
+    assert (apart_for_a_phase(piece) == RV).any() == held
+
+
+def test_where_nothing_is_left_there_is_background():
+    """An island that the network is wholly sure of: no other class has any chance."""
+    heart = np.stack([ring()] * 3)
+    heart[:, 2:8, 2:8] = ATRIUM
+    sure = np.moveaxis(np.eye(7, dtype=np.float32)[heart], -1, -3)
+    found = clean_probability(sure, PIXEL_MM)
+    np.testing.assert_array_equal(found[:, 0, 2:8, 2:8], 1)
+    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-6)

@@ -16,7 +16,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.exact import ExactSurface, points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
-from pipeline.field.certificate import certify
+from pipeline.field.certificate import certify, require_bounds
 from pipeline.field.fixture import Bounds
 from pipeline.field.manifest import write_manifest
 from pipeline.field.steps import largest_change, largest_steps
@@ -451,3 +451,56 @@ def test_nodes_on_the_wrong_side_are_counted_however_near_the_surface(tmp_path):
     values[np.abs(values) < 2] *= -1
     surfaces = {name: ball_and_core()[name] for name in field.structures}
     assert certify(field, surfaces, 2000, lambda: None)["sign_errors"] > 0
+
+
+@pytest.mark.parametrize(
+    "name", ["node_error_near_mm", "node_error_far_mm", "sign_errors", "surface_error_p99_mm"]
+)
+@pytest.mark.parametrize("beyond", [1.01, float("nan")])
+def test_every_bound_holds_its_own_figure(name, beyond):
+    """What the settings say, on a grid of 1.5 mm; a figure that is none keeps to nothing."""
+    at = {
+        "node_error_near_mm": 1e-3,
+        "node_error_far_mm": 0.02,
+        "sign_errors": 0,
+        "surface_error_p99_mm": 0.25 * 1.5,
+    }
+    require_bounds({**at, "structures": {"ball": at, "core": at}}, Bounds(), 1.5)
+    over = at | {name: beyond * (at[name] or 1)}
+    with pytest.raises(StageError, match=rf"must be: {name} is [^;]*most at core[^;]*; choose"):
+        require_bounds({**over, "structures": {"ball": at, "core": over}}, Bounds(), 1.5)
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "near", "far"),
+    [(3.0, 14.0, 0.05, 0.0), (16.0, 99.0, 0.0, 0.05)],
+)
+def test_an_error_of_one_phase_and_structure_is_the_certificates(tmp_path, least, most, near, far):
+    bake_small(tmp_path / "f.zarr")
+    field = ForceField.open(tmp_path / "f.zarr")
+    chunk = tmp_path / "f.zarr" / "distance" / "ball" / "c" / "1" / "0" / "0" / "0"
+    values = np.memmap(chunk, "<f4", "r+")
+    values[(values > least) & (values < most)] += 0.05
+    values.flush()
+    surfaces = {name: ball_and_core()[name] for name in field.structures}
+    said = certify(field, surfaces, 4000, lambda: None)
+    for one in (said, said["structures"]["ball"]):
+        assert one["node_error_near_mm"] == pytest.approx(near, abs=1e-4)
+        assert one["node_error_far_mm"] == pytest.approx(far, abs=1e-4)
+    assert said["structures"]["core"]["node_error_near_mm"] < 1e-4
+
+
+def test_wrong_signs_of_all_structures_and_phases_are_added(tmp_path):
+    bake_small(tmp_path / "f.zarr")
+    field = ForceField.open(tmp_path / "f.zarr")
+    for name, phase in (("ball", 1), ("ball", 3), ("core", 2)):
+        chunk = tmp_path / "f.zarr" / "distance" / name / "c" / str(phase) / "0" / "0" / "0"
+        values = np.memmap(chunk, "<f4", "r+")
+        values[np.abs(values) < 2] *= -1
+        values.flush()
+    surfaces = {name: ball_and_core()[name] for name in field.structures}
+    said = certify(field, surfaces, 4000, lambda: None)
+    ball, core = (said["structures"][name] for name in ("ball", "core"))
+    assert [one > 0 for one in ball["sign_errors_by_phase"]] == [False, True, False, True, False]
+    assert ball["sign_errors"] == sum(ball["sign_errors_by_phase"])
+    assert said["sign_errors"] == ball["sign_errors"] + core["sign_errors"] > ball["sign_errors"]

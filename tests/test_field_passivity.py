@@ -174,3 +174,23 @@ def test_in_debt_a_tool_at_rest_feels_only_what_brakes():
     assert along(tank, 0.0, 1) == 0
     assert along(tank, -1e-9, 1) > 0
     assert along(tank, 0.0, 1) > 0
+
+
+def test_of_a_way_that_was_not_seen_only_what_the_hand_got_counts():
+    """1 N over 2 mm that no sensor saw: 2 mJ are gone, or none came; then ways count again."""
+    nowhere, pull = (float("nan"), 0.0, 0.0), (1.0, 0.0, 0.0)
+    for to_mm, level_mj in ((2.0, 3.0), (-2.0, 5.0)):
+        tank = EnergyTank(5.0, 20.0)
+        assert tank.passed((0.0, 0.0, 0.0), pull) == pull
+        assert tank.passed(nowhere, pull) == (0.0, 0.0, 0.0)
+        tank.passed((to_mm, 0.0, 0.0), pull)
+        assert tank.level_mj == pytest.approx(level_mj)
+    tank.passed((-4.0, 0.0, 0.0), pull)
+    assert tank.level_mj == pytest.approx(7.0)
+
+
+def test_in_debt_a_force_across_the_way_waits_too():
+    """1 mJ more went along x than there was: only what takes it back is rendered."""
+    tank = EnergyTank(0.0, 5.0)
+    tank.passed((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    assert tank.passed((1.0, 0.0, 0.0), (-1.0, 1.0, 0.0)) == (-1.0, 0.0, 0.0)

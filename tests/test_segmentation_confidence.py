@@ -14,7 +14,7 @@ from data_synth.population import draw_heart
 from pipeline.errors import StageError
 from pipeline.imaging import confidence
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.confidence import slice_confidence
+from pipeline.imaging.confidence import _without_strays, slice_confidence
 from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
@@ -430,3 +430,130 @@ def test_a_slice_out_of_step_is_named_by_the_cines_own_number(study, understood)
     found = segment_cine(replace(cine, intensity=images, mr_from_index=downwards), QUICK)
     assert list(found.out_of_step) == [4, 6]
     assert all(one["in_step"] < 0 for one in found.out_of_step.values())
+
+
+ASIDE = (20, 24)
+"""Pixels by which labels leave no pixel of the heart in its place."""
+
+
+def test_a_heart_that_jumps_in_all_slices_for_a_phase_is_doubted_then_alone():
+    """Labels of the phases before and after share no pixel with it; neighbouring slices agree."""
+    cine, found = beating()
+    found.value[2] = np.roll(found.value[2], ASIDE, (2, 3))
+    doubt = slice_confidence(cine, found, drawn(found))
+    np.testing.assert_array_equal(doubt[2], 0)
+    assert np.delete(doubt, 2, axis=0).min() > 0.7
+
+
+def test_a_heart_that_lies_aside_on_a_slice_in_all_phases_is_doubted_there_alone():
+    cine, found = beating()
+    found.value[:, 2] = np.roll(found.value[:, 2], ASIDE, (2, 3))
+    doubt = slice_confidence(cine, found, drawn(found))
+    np.testing.assert_array_equal(doubt[:, 2], 0)
+    assert np.delete(doubt, 2, axis=1).min() > 0.5
+
+
+def test_a_heart_that_is_missed_for_a_phase_is_doubted():
+    """The network is sure that there is none; before and after it is large."""
+    cine, found = beating()
+    found.value[2, 2] = 0
+    found.value[2, 2, 0] = 1
+    doubt = slice_confidence(cine, found, drawn(found))
+    assert doubt[2, 2] == 0
+    assert doubt[[1, 3], 2].min() > 0.7
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.30, False), (0.40, True)])
+def test_a_tip_comes_and_goes_below_35_percent_of_the_largest_cut(share, doubted):
+    cine, found = beating()
+    away = np.hypot(*(np.mgrid[:64, :64] - 31.5))
+    body, tip = away < 15, away < 15 * share**0.5
+    assert tip.sum() / body.sum() == pytest.approx(share, abs=0.03)
+    found.value[:, :, 1] = 0.9 * body
+    found.value[:, 0, 1] = 0.9 * tip
+    found.value[2, 0, 1] = 0
+    found.value[:, :, 0] = 1 - found.value[:, :, 1]
+    trusted = slice_confidence(cine, found, drawn(found))
+    assert (trusted[2, 0] == 0) == doubted
+    assert doubted or trusted[2, 0] > 0.7
+
+
+def test_what_is_added_to_a_cut_is_a_quarter_of_the_largest_as_sure_as_the_outline():
+    """By hand: Dice of tip (chance c) and of what is added, a cut of known certainty."""
+    cine, found = beating()
+    away = np.hypot(*(np.mgrid[:64, :64] - 31.5))
+    body, tip, c = away < 15, away < 6, 0.6
+    found.value[:, :, 1] = 0.9 * body
+    found.value[:, 0, 1] = c * tip
+    found.value[:, :, 0] = 1 - found.value[:, :, 1]
+    n, few = body.sum(), tip.sum()
+    sure = (c * few + (n - few)) / n
+    expected = (2 * c * few + n / 4 * sure) / ((1 + c) * few + n / 4)
+    trusted = slice_confidence(cine, found, drawn(found))[:, 0]
+    np.testing.assert_allclose(trusted, expected, rtol=1e-4)
+
+
+def unlike(shape, where, cosine):
+    """Unit vectors, all the same but ``where`` one has that cosine with the others."""
+    images = np.zeros((*shape, 2), np.float32)
+    images[..., 0] = 1
+    images[where] = cosine, (1 - cosine**2) ** 0.5
+    return images
+
+
+@pytest.mark.parametrize(
+    ("where", "cosine", "share"),
+    [
+        (np.s_[3], 0.15, 0.5),
+        (np.s_[3], 0.31, 1.0),
+        (np.s_[3], -0.1, 0.0),
+        (np.s_[:, 1], 0.125, 0.5),
+        (np.s_[:, 3], 0.125, 0.5),
+        (np.s_[:, 2], 0.26, 1.0),
+        (np.s_[:, 2], -0.1, 0.0),
+        (np.s_[:, 0], 0.125, 0.75),
+        (np.s_[:, 4], 0.125, 0.75),
+    ],
+)
+def test_how_much_counts_by_the_correlation_with_the_closest_neighbour(
+    monkeypatch, where, cosine, share
+):
+    cine, found = beating()
+    shape = found.value.shape[:2]
+    trusted = []
+    for images in (unlike(shape, where, 1.0), unlike(shape, where, cosine)):
+        monkeypatch.setattr(confidence, "_images", lambda *_, images=images: images)
+        trusted.append(slice_confidence(cine, found, drawn(found)))
+    np.testing.assert_allclose((trusted[1] / trusted[0])[where], share, atol=1e-5)
+
+
+@pytest.mark.parametrize(("step_mm", "doubted"), [(12.0, True), (14.0, False)])
+def test_slices_far_apart_need_not_look_alike(step_mm, doubted):
+    cine, found = beating()
+    cine = replace(cine, mr_from_index=np.diag([1.5, 1.5, step_mm, 1.0]))
+    found = replace(found, view=view_of(cine))
+    cine.intensity[:, found.view.order[2]] *= -1
+    assert (slice_confidence(cine, found, drawn(found))[:, 2].max() < 0.1) == doubted
+
+
+DISC = np.hypot(*(np.mgrid[:64, :64] - 20)) < 8
+OTHER = np.hypot(*(np.mgrid[:64, :64] - 50)) < 7
+NONE = np.zeros_like(DISC)
+
+
+@pytest.mark.parametrize(
+    ("planes", "kept"),
+    [
+        ("HHHHNH", "HHHHNH"),
+        ("HHHHNNH", "HHHHNNN"),
+        ("HNNHHHH", "NNNHHHH"),
+        ("HHHHO", "HHHHN"),
+        ("OHHHH", "NHHHH"),
+        # Two bodies beside it, which together are larger.
+        ("OOHHHNOO", "NNHHHNNN"),
+    ],
+)
+def test_the_heart_is_the_largest_body_with_one_gap_at_most(planes, kept):
+    draw = {"H": DISC, "O": OTHER, "N": NONE}
+    given, expected = (np.stack([draw[one] for one in text]) for text in (planes, kept))
+    np.testing.assert_array_equal(_without_strays(given), expected)

@@ -6,6 +6,7 @@ compared between neighbouring nodes and phases, and between places 0.1 mm and mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -113,8 +114,7 @@ def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: floa
     """
     parts = accuracy["structures"]
     broken = [
-        f"{name} is {accuracy[name]:.4g} (most at {max(parts, key=lambda one: parts[one][name])}), "
-        f"allowed is {limit:.4g}"
+        f"{name} is {accuracy[name]:.4g} (most at {_worst(parts, name)}), allowed is {limit:.4g}"
         for name, limit in allowed_errors(bounds, spacing_mm).items()
         if not accuracy[name] <= limit
     ]
@@ -123,6 +123,11 @@ def require_bounds(accuracy: Mapping[str, Any], bounds: Bounds, spacing_mm: floa
             f"bake: the field is not as exact as it must be: {'; '.join(broken)}; choose a finer "
             "bake.spacing_mm, allow more in bake.bounds, or take that structure's fixtures out"
         )
+
+
+def _worst(parts: Mapping[str, Any], name: str) -> str:
+    """The structure whose figure is the largest, or is none."""
+    return max(parts, key=lambda one: (math.isnan(parts[one][name]), parts[one][name]))
 
 
 def _distance_errors(
