@@ -132,6 +132,7 @@ def test_force_at_the_handle_never_exceeds_that_of_the_fixture(room):
     assert sums[Sum.FORCE] <= OMEGA.f_max_n * (1 + 1e-12)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_table_and_another_overlaps(room):
     conditions = [Condition("point", True), Condition("point", True, OMEGA)]
     one = run_all(room, conditions, 1, 16)

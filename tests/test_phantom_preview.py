@@ -153,6 +153,7 @@ def test_surfaces_are_drawn_from_three_sides_at_both_moments(html: str) -> None:
         assert (border > 235).all(), "cut off at the edge"
 
 
+@pytest.mark.slow
 def test_a_sweep_of_one_frame_does_not_keep_the_heart_from_being_drawn(
     study: SyntheticStudy, html: str
 ) -> None:

@@ -301,6 +301,7 @@ def test_a_folder_that_is_no_study_is_never_overwritten(tmp_path):
         settings_of(tmp_path / "precious")
 
 
+@pytest.mark.slow
 def test_each_patient_can_be_made_alone(tmp_path):
     config = tmp_path / "small.yaml"
     config.write_text(yaml.safe_dump({**SMALL, "cine_only": True, "long_axis": False}))

@@ -323,6 +323,7 @@ def test_a_cine_alone_as_nifti_is_baked_in_the_frame_of_the_mr(
     assert (found / name).read_bytes() == (products / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_stack_that_ends_at_the_valves_is_baked_without_atria(
     work: Path, products: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

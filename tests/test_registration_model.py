@@ -329,6 +329,7 @@ class TestClimb:
         # shrink by half or better each time: two ends lie twice that apart at most.
         assert max(shift_mm for shift_mm, _ in away) < 2 * 0.02 * np.sqrt(3)
 
+    @pytest.mark.slow
     def test_it_goes_as_high_as_a_search_without_slopes(self, recording, level, pivot):
         start = start_off(recording, 2, 2, 2)
         found = minimize(

@@ -156,6 +156,7 @@ def turned_about(point_mm, degrees):
     return motion
 
 
+@pytest.mark.slow
 def test_a_patient_who_moves_is_told_from_one_who_lies_still():
     recording = record(seed=0, frames=30)
     inverse = np.linalg.inv(recording.mr_from_tracker)

@@ -141,6 +141,7 @@ class TestRegister:
         assert found.verdict != "failed"
         assert found.start_score == 0
 
+    @pytest.mark.slow
     def test_same_input_gives_the_same_bytes(self, surfaces, recording):
         start = start_off(recording, 7, 5, 5)
         one_start = QUICK.model_copy(update={"starts": 1})

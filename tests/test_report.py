@@ -89,6 +89,7 @@ def test_of_two_hundred_slices_a_choice_from_end_to_end_of_the_heart_is_shown() 
     assert set(np.diff(found)) == {6}
 
 
+@pytest.mark.slow
 def test_the_least_certain_of_many_slices_are_among_those_shown() -> None:
     confidence = np.full((2, 200), 0.97)
     confidence[0, [1, 41, 43]], confidence[1, [52, 198]] = (0.7, 0.6, 0.75), (0.5, 0.7)

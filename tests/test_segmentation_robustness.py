@@ -85,7 +85,7 @@ def test_images_without_a_heart_are_refused_by_slice_and_phase(kind, seed):
         segment_cine(without_heart(kind, seed), AS_USUAL)
 
 
-@pytest.mark.parametrize("kind", ["constant", "gradient"])
+@pytest.mark.parametrize("kind", ["constant", pytest.param("gradient", marks=pytest.mark.slow)])
 def test_images_that_show_nothing_are_refused(kind):
     with pytest.raises(StageError, match="no heart found"):
         segment_cine(without_heart(kind), AS_USUAL)
