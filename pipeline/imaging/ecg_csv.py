@@ -115,12 +115,21 @@ def _csv_row(path: Path, number: int, line: str, columns: int) -> list[float]:
         remedy = "write nan where a sample is missing"
     elif "." not in line and len(cells) == 2 * columns:
         remedy = "decimal commas look like separators: write points"
-    wrong = [place for place, cell in enumerate(cells, 1) if not _is_number(cell)]
+    wrong = [place for place, cell in enumerate(cells, 1) if not _is_sample(cell, place == 1)]
     which = f"; no number is in cell {', '.join(map(str, wrong[:8]))}" if wrong else ""
     raise InputError(
-        f"{path}, line {number}: needs {columns} finite numbers separated by commas, has "
+        f"{path}, line {number}: needs {columns} numbers separated by commas, has "
         f"{len(cells)} cells{which}; {remedy}"
     )
+
+
+def _is_sample(cell: str, is_time: bool) -> bool:
+    """Whether a cell holds a time, or millivolts, which may be missing."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return False
+    return math.isfinite(value) or (math.isnan(value) and not is_time)
 
 
 def _is_number(cell: str) -> bool:
