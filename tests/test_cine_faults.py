@@ -360,7 +360,7 @@ def test_a_stack_whose_header_lost_the_distance_of_its_slices_is_refused(
         require_room_for_a_heart(cine, "here")
 
 
-@pytest.mark.parametrize("phases", [6, 14])
+@pytest.mark.parametrize("phases", [6, pytest.param(14, marks=pytest.mark.slow)])
 def test_slices_and_phases_that_are_exchanged_are_refused(phases: int) -> None:
     """Of a chest by another renderer, through a whole beat and through most of one."""
     for covered in (1.0, 0.7):

@@ -194,7 +194,7 @@ def truly(recording, surfaces):
     return find(recording.sweeps, recording.phases, surfaces, start, QUICK)
 
 
-@pytest.mark.parametrize("choice", ["apply", "ignore"])
+@pytest.mark.parametrize("choice", ["apply", pytest.param("ignore", marks=pytest.mark.slow)])
 def test_registration_is_made_at_the_phases_of_one_clock(recording, surfaces, truly, choice):
     timing = stamped(recording, 0.15)
     chosen = QUICK.model_copy(update={"clock_offset": choice})

@@ -231,7 +231,7 @@ int main(int count, char **words)
 """
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "g++"])
+@pytest.mark.parametrize("compiler", [pytest.param("gcc", marks=pytest.mark.slow), "g++"])
 def test_the_pages_turn_of_a_loop_is_what_python_does(tmp_path, path, compiler):
     """Tracker, clock, fade, the device's limit, tank; the tip is not seen for 60 ms while it moves,
     is told to be elsewhere from one turn to the next, and leaves the grid at last."""

@@ -110,6 +110,7 @@ def test_the_fit_brings_the_zero_to_the_surface(tmp_path):
     assert 0 < moved.max() <= stated_mm
 
 
+@pytest.mark.slow
 def test_between_phases_the_surface_is_the_true_one_of_the_phantom(tmp_path):
     """Truth: the phantom's surface at moments between 25 phases, which nothing was given: its
     vertices, and the middles of its triangles, which the fit is not told of at any moment. The
@@ -177,7 +178,7 @@ def test_the_motion_is_sure_of_what_rests_and_of_what_moves_along_the_surface(ph
     assert np.abs(swing / most_mm - across).max() < 0.02
 
 
-@pytest.mark.parametrize("count", [9, 16])
+@pytest.mark.parametrize("count", [9, pytest.param(16, marks=pytest.mark.slow)])
 def test_a_guess_between_few_phases_bends_the_distance_about_the_surface_less(
     tmp_path, monkeypatch, count
 ):

@@ -43,7 +43,12 @@ def watched(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("compiler", "standard"), [("gcc", "-std=c99"), ("gcc", "-std=c11"), ("g++", "-std=c++11")]
+    ("compiler", "standard"),
+    [
+        ("gcc", "-std=c99"),
+        pytest.param("gcc", "-std=c11", marks=pytest.mark.slow),
+        ("g++", "-std=c++11"),
+    ],
 )
 @pytest.mark.parametrize("source", [EXAMPLE, HERE / "field_driver.c"])
 def test_compiles_without_a_warning(tmp_path, compiler, standard, source):

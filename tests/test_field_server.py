@@ -310,7 +310,7 @@ def test_what_is_no_number_is_refused_where_sums_may_be_reordered(
     assert run(program, field).stdout == b"0\n"
 
 
-@pytest.mark.parametrize("standard", ["gnu99", "gnu17"])
+@pytest.mark.parametrize("standard", [pytest.param("gnu99", marks=pytest.mark.slow), "gnu17"])
 def test_other_declarations_are_left_to_the_program(tmp_path, standard):
     source = tmp_path / "own.c"
     source.write_text(
@@ -342,7 +342,7 @@ int main(int count, char **words)
 """
 
 
-@pytest.mark.parametrize("phase", [1e17, -1e300])
+@pytest.mark.parametrize("phase", [1e17, pytest.param(-1e300, marks=pytest.mark.slow)])
 def test_nor_does_more_count_where_the_first_interval_begins_past_0(path, tmp_path, phase):
     late = described(path, tmp_path / "late.zarr", phases=[0.3, 0.35, 0.4, 0.5, 0.9])
     field = ForceField.open(late)

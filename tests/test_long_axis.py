@@ -370,7 +370,9 @@ def in_plane_mm(*given: Any) -> Any:
     return slice_shifts_mm(*given)[:, :2]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 4))]
+)
 def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None:
     cine, views, slices_mm, _ = stack_and_views(seed)
     view = view_of(cine)
@@ -437,6 +439,7 @@ def test_slices_of_one_volume_are_not_moved() -> None:
     assert find_crossings(thin, views, view_of(thin), drawn) is NO_CROSSINGS
 
 
+@pytest.mark.slow
 def test_a_shift_seen_in_the_plane_tells_of_the_one_along_the_normal() -> None:
     """What is left is the variance of a normal distribution's third component, given two."""
     count = 400

@@ -106,7 +106,8 @@ def test_meshes_share_triangles_between_phases_and_follow_the_map(heart):
 
 
 @pytest.mark.parametrize(
-    ("pathology", "phase"), [("healthy", 0.0), ("healthy", 0.43), ("infarct", 0.0)]
+    ("pathology", "phase"),
+    [("healthy", 0.0), ("healthy", 0.43), pytest.param("infarct", 0.0, marks=pytest.mark.slow)],
 )
 def test_mesh_volumes_agree_with_counted_labels_within_one_percent(pathology, phase):
     """Labels and meshes come from one source by two roads: counting and marching cubes."""

@@ -166,6 +166,7 @@ def test_a_sweep_of_one_frame_does_not_keep_the_heart_from_being_drawn(
     assert {"end-diastole/front", "sweep/front"} <= set(drawn)
 
 
+@pytest.mark.slow
 def test_a_study_without_ecg_ultrasound_and_views_has_a_page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

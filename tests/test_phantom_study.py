@@ -417,7 +417,7 @@ except SynthError as error:
 """
 
 
-@pytest.mark.parametrize("what", ["mesh", "sweep"])
+@pytest.mark.parametrize("what", [pytest.param("mesh", marks=pytest.mark.slow), "sweep"])
 def test_what_libraries_write_on_a_full_disk_is_told_too(tmp_path, what):
     """Here a limit on the size of files; libraries may end the process, or say nothing."""
     done = subprocess.run(

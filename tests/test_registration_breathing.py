@@ -82,6 +82,7 @@ def breathing():
     return sweeps, recording.phases, truth, np.concatenate(depths)
 
 
+@pytest.mark.slow
 def test_breath_is_followed_and_the_pose_is_that_of_rest(breathing, monkeypatch):
     sweeps, phases, truth, depth_mm = breathing
     surfaces = moving_surfaces()

@@ -171,6 +171,7 @@ class TestThreeSweeps:
         assert freed.expected_mm > fixed.expected_mm
 
 
+@pytest.mark.slow
 def test_a_probe_that_only_moves_on_leaves_the_pose_as_open_as_the_calibration(surfaces, points):
     """One sweep, moved without a turn: a shift of all its pictures is one of the tracker.
 

@@ -246,6 +246,7 @@ def test_without_a_lid_at_the_valves_nothing_is_open(whole):
     assert draw_tissue(surfaces, 2.5).share.shape[-1] == 2
 
 
+@pytest.mark.slow
 def test_atria_that_a_model_lacks_do_not_draw_the_pose_along(whole):
     """Beside what the whole model finds; blind without the muscle that tells where the lid is."""
     surfaces = ventricles(whole, last_mm=14.0)

@@ -252,6 +252,7 @@ def test_ten_frames_that_hardly_turn_are_no_contradiction():
     assert np.sqrt(np.trace(found.spread_mm2)) < 1.5
 
 
+@pytest.mark.slow
 def test_a_bump_is_told_and_leaves_the_pose_of_use():
     """Twelve frames of 80 were taken while the patient lay 9 mm beside: they are told, with where
     they lie, and the pose by the others is right, and expected so within what they leave open."""

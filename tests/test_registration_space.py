@@ -72,9 +72,8 @@ def timing_of(recording, cycle_rr_s):
 
 
 class TestRegister:
-    @pytest.mark.parametrize(
-        "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))]
-    )
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", range(3))
     def test_pose_is_found_from_15_mm_and_15_degrees_away(self, surfaces, recording, seed):
         start = start_off(recording, 100 + seed, 15, 15)
         told = []
@@ -117,6 +116,7 @@ class TestRegister:
         assert found.verdict in ("good", "doubtful")
         assert (found.reason == "") == (found.verdict == "good")
 
+    @pytest.mark.slow
     def test_a_model_that_lacks_blood_is_less_sure_and_says_so(
         self, surfaces, recording, monkeypatch
     ):
@@ -314,7 +314,9 @@ class TestRefusals:
         ("exchange", "told"),
         [
             (np.s_[:, :, ::-1], "mirrored from left to right (ImageToProbe"),
-            (np.s_[:, ::-1], "turned upside down (ImageToProbe"),
+            pytest.param(
+                np.s_[:, ::-1], "turned upside down (ImageToProbe", marks=pytest.mark.slow
+            ),
         ],
     )
     def test_how_pictures_were_exchanged_is_told(self, recording, exchange, told):

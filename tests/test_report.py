@@ -75,7 +75,7 @@ def titled(figure: Figure) -> list[str]:
     return [axis.get_title() for axis in figure.axes if axis.get_title()]
 
 
-@pytest.mark.parametrize("count", [3, 5, 16, 24])
+@pytest.mark.parametrize("count", [3, 5, 16, pytest.param(24, marks=pytest.mark.slow)])
 def test_every_slice_of_a_usual_stack_is_shown_in_its_order(count: int) -> None:
     figure = slices.contours(moments(count), 0)
     assert titled(figure) == [f"slice {number}" for number in range(count)]

@@ -173,6 +173,7 @@ def test_storage_order_of_the_images_does_not_matter(study):
     np.testing.assert_allclose(again.confidence[:, ::-1], found.confidence, atol=0.01)
 
 
+@pytest.mark.slow
 def test_same_images_give_the_same_bytes_units_do_not_matter_and_phases_are_counted(study):
     _, cine, _, found = study
     louder, told = replace(cine, intensity=cine.intensity * np.float32(2)), []
@@ -224,6 +225,7 @@ def test_every_empty_slice_is_named_and_only_inner_ones_are_to_be_redrawn(study)
         segment_cine(replace(cine, intensity=empty), QUICK)
 
 
+@pytest.mark.slow
 def test_a_single_spoilt_image_is_named(study):
     cine = study[1]
     images = cine.intensity.copy()

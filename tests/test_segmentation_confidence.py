@@ -66,7 +66,8 @@ def test_a_good_study_of_low_signal_is_trusted(understood):
 
 
 @pytest.mark.parametrize(
-    ("number", "fault"), [(0, "elsewhere"), (4, "elsewhere"), (SLICES - 1, "noise")]
+    ("number", "fault"),
+    [(0, "elsewhere"), pytest.param(4, "elsewhere", marks=pytest.mark.slow), (SLICES - 1, "noise")],
 )
 def test_a_spoilt_image_is_refused_at_either_end_and_between(study, number, fault):
     """Noise, or another place of the body, in one phase of one slice."""
@@ -80,6 +81,7 @@ def test_a_spoilt_image_is_refused_at_either_end_and_between(study, number, faul
         segment_cine(with_image(images, 1, number, spoilt.astype(np.float32)), QUICK)
 
 
+@pytest.mark.slow
 def test_a_blurred_slice_passes_with_a_lower_figure(study, understood):
     images, _ = study
     blurred = gaussian_filter(images.intensity[1, 4], 4.0)
@@ -141,7 +143,13 @@ def stripes():
 
 
 @pytest.mark.parametrize(
-    "what", [pytest.param(brain, marks=pytest.mark.slow), head, noise, stripes]
+    "what",
+    [
+        pytest.param(brain, marks=pytest.mark.slow),
+        head,
+        pytest.param(noise, marks=pytest.mark.slow),
+        stripes,
+    ],
 )
 def test_what_is_no_heart_is_refused_with_phase_slice_and_advice(what):
     with pytest.raises(StageError, match=NAMED) as refused:

@@ -24,6 +24,9 @@ from tests.outside_people import ILLNESSES, draw_body, made_ill
 SEEDS = (1, 2, 3)
 """Three people; nothing was chosen by what they give."""
 
+FEW = SEEDS[:1]
+"""Those whom quick tests ask."""
+
 AS_USUAL = SegmentSettings(most_views=2)
 """The ways in which a study of 12 slices in 25 phases is looked at; one of two phases would be in
 five."""
@@ -40,10 +43,14 @@ def drawn(seed):
     return render(seed, Scan())
 
 
-CHILDREN = pytest.param((0.7, SEEDS[1:]), id="children", marks=pytest.mark.slow)
+PEOPLE = (
+    pytest.param((1.0, FEW), id="an adult"),
+    pytest.param((1.0, SEEDS), id="adults", marks=pytest.mark.slow),
+    pytest.param((0.7, SEEDS[1:]), id="children", marks=pytest.mark.slow),
+)
 
 
-@pytest.fixture(scope="module", params=[pytest.param((1.0, SEEDS), id="adults"), CHILDREN])
+@pytest.fixture(scope="module", params=PEOPLE)
 def people(request):
     """Truth and labels of each person at end-diastole and end-systole; a child is all smaller."""
     size, seeds = request.param
@@ -79,7 +86,9 @@ def test_no_person_is_lost(people):
             assert dice(found == LABELS[name], truth == LABELS[name]) > 2 / 3
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("brain", 1), ("chest", 1)])
+@pytest.mark.parametrize(
+    ("kind", "seed"), [pytest.param("brain", 1, marks=pytest.mark.slow), ("chest", 1)]
+)
 def test_images_without_a_heart_are_refused_by_slice_and_phase(kind, seed):
     with pytest.raises(StageError, match=r"(?s)(slice.*phase|phase.*slice)"):
         segment_cine(without_heart(kind, seed), AS_USUAL)
