@@ -58,8 +58,9 @@ class Work(NamedTuple):
     """``(depth + 1, 12, n)``: boxes that blocks hold, one list a depth, rows as in the tree; and
     those of one of them that were sifted."""
 
-    numbers: npt.NDArray[np.int32]
-    """``(depth, n)``: numbers of these boxes in their level of the tree."""
+    numbers: npt.NDArray[np.uint32]
+    """``(depth, n)``: numbers of these boxes in their level of the tree. Unsigned, as are places:
+    a signed index is asked first whether it counts from the end."""
 
     counts: Integer
     """``(depth,)``: how many they are."""
@@ -70,7 +71,7 @@ class Work(NamedTuple):
     bound: Float32
     """``(n,)``: a figure for every box of a list."""
 
-    kept: npt.NDArray[np.int32]
+    kept: npt.NDArray[np.uint32]
     """``(n,)``: places in a list."""
 
     upper: Float32
@@ -113,11 +114,11 @@ def prepared(tree):  # type: ignore[no-untyped-def]
     room = (len(tree.triangles) // fan + 1 + fan) * fan + LANES
     return Work(
         np.empty((DEPTHS + 1, tree.boxes.shape[1], room), np.float32),
-        np.empty((DEPTHS, room), np.int32),
+        np.empty((DEPTHS, room), np.uint32),
         np.zeros(DEPTHS, np.int64),
         np.zeros(DEPTHS, np.int64),
         np.empty(room, np.float32),
-        np.empty(room, np.int32),
+        np.empty(room, np.uint32),
         np.empty(CORNERS, np.float32),
         np.empty(3),
         np.empty(3),
@@ -281,7 +282,9 @@ def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: igno
             plane2 = min(plane2, past * past + beyond_ac * beyond_ac)
             outside = max(max(beyond_bc, beyond_ac), -v)
             plane2 = plane2 if outside > 0.0 else 0.0
-            best[i] = min(best[i], plane2 + w * w)
+            # Zero alters nothing, but what stays as it was is then written as well: a write that
+            # leaves out lanes is slow on some processors.
+            best[i] = max(min(best[i], plane2 + w * w), 0.0)
 
 
 @njit(nogil=True, cache=True, forceinline=True)
@@ -358,8 +361,23 @@ def _open(tree, work, source, target, count):  # type: ignore[no-untyped-def]
     for k in range(count):
         group, first = start + kept[k], k * FAN
         for row in range(BOX_ROWS):
-            for lane in range(FAN):
-                lists[row, first + lane] = boxes[group, row, lane]
+            # All eight are read before one is written, so that they travel as a vector.
+            a, b, c, d = (
+                boxes[group, row, 0],
+                boxes[group, row, 1],
+                boxes[group, row, 2],
+                boxes[group, row, 3],
+            )
+            e, f, g, h = (
+                boxes[group, row, 4],
+                boxes[group, row, 5],
+                boxes[group, row, 6],
+                boxes[group, row, 7],
+            )
+            lists[row, first], lists[row, first + 1] = a, b
+            lists[row, first + 2], lists[row, first + 3] = c, d
+            lists[row, first + 4], lists[row, first + 5] = e, f
+            lists[row, first + 6], lists[row, first + 7] = g, h
         for lane in range(FAN):
             numbers[first + lane] = kept[k] * FAN + lane
     work.counts[target] = FAN * count
