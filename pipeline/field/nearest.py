@@ -18,8 +18,9 @@ Boxes are compared in single precision, sixteen at a time on a wide processor, a
 larger by more than the rounding; triangles are measured in double precision, so the distance that
 comes out is exact.
 
-Kernels are compiled into their callers: a call hands over every array of the tree and of the work,
-and counts who holds them, 0.4 microseconds a cube in all.
+Kernels are compiled into their callers, for a call hands over every array of the tree and of the
+work. They make no array and do not count who holds one, which takes as long as a tenth of the
+search: whoever calls `block_distance` holds them all.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ BOX_TO_BLOCK = 0.5
 SLACK, MORE_SLACK = np.float32(1 + 1e-6), np.float32(1 + 8e-6)
 # Numba compiles a function anew for a literal number; this one is a number like any other.
 NOUGHT = np.int64(0)
+# Without a count of who holds which array.
+UNCOUNTED = {"nogil": True, "cache": True, "_nrt": False}
 # Minima are vector instructions only where NaN is ruled out. Fused products round less, not more.
 FAST = {"nnan", "nsz", "contract"}
 
@@ -92,6 +95,15 @@ class Work(NamedTuple):
     best: Float
     """``(8,)``: their distances, squared until the last."""
 
+    least: Float32
+    """``(16,)``: the least of a figure in every lane."""
+
+    first: Integer
+    """``(depth, 3)``: first node (z, y, x) of the block of each depth."""
+
+    visited: Integer
+    """``(depth,)``: how many of its eight parts are done."""
+
 
 def levels_of_blocks(tree: TriangleTree, spacing_mm: tuple[float, float, float]) -> Integer:
     """Level of the boxes that blocks of 32, 16, 8 and 4 nodes a side hold: single triangles in the
@@ -125,10 +137,13 @@ def prepared(tree):  # type: ignore[no-untyped-def]
         np.empty(3),
         np.empty((3, CORNERS)),
         np.empty(CORNERS),
+        np.empty(LANES, np.float32),
+        np.empty((DEPTHS, 3), np.int64),
+        np.empty(DEPTHS, np.int64),
     )
 
 
-@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+@njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
 def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
     """Place in a list of the box whose middle is closest to the block's."""
     lists, away2, count = work.lists, work.bound, work.counts[depth]
@@ -139,7 +154,7 @@ def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
     for k in range(count, -count // LANES * -LANES):
         away2[k] = np.inf
     # One minimum a lane, for a single one is found box after box.
-    least = np.empty(LANES, np.float32)
+    least = work.least
     for lane in range(LANES):
         least[lane] = np.inf
     for k in range(0, count, LANES):
@@ -154,7 +169,7 @@ def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
     return closest
 
 
-@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+@njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
 def _away2(u, v, w, half):  # type: ignore[no-untyped-def]
     """Squared distance from a box, in its axes."""
     zero = np.float32(0)
@@ -166,7 +181,7 @@ def _away2(u, v, w, half):  # type: ignore[no-untyped-def]
     return du * du + dv * dv + dw * dw
 
 
-@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+@njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
 def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ignore[no-untyped-def]
     """For each box: the least, over the corners of a block, of its squared distance less the
     bound there.
@@ -204,7 +219,7 @@ def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ig
         bound[k] = min(least, one)
 
 
-@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+@njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
 def _least_bounds(lists, depth, count, middle, half, point, bound):  # type: ignore[no-untyped-def]
     """For each box: no more than `_bounds` tells where its bounds are the ways to ``point``."""
     zero, two = np.float32(0), np.float32(2)
@@ -229,7 +244,7 @@ def _least_bounds(lists, depth, count, middle, half, point, bound):  # type: ign
         bound[k] = du * du + dv * dv + dw * dw - MORE_SLACK * most
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _closest_point(triangles, t, point, closest):  # type: ignore[no-untyped-def]
     """The point of triangle t that is closest to another point."""
     x, y, z = point[0] - triangles[t, 0], point[1] - triangles[t, 1], point[2] - triangles[t, 2]
@@ -251,7 +266,7 @@ def _closest_point(triangles, t, point, closest):  # type: ignore[no-untyped-def
         closest[k] = triangles[t, k] + u * triangles[t, 3 + k] + v * triangles[t, 6 + k]
 
 
-@njit(nogil=True, cache=True, forceinline=True, fastmath=FAST)
+@njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
 def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: ignore[no-untyped-def]
     """Squared distance from nodes to some triangles of a list, where it is less than ``best``.
 
@@ -287,7 +302,7 @@ def _measure(triangles, numbers, depth, kept, count, nodes, best):  # type: igno
             best[i] = max(min(best[i], plane2 + w * w), 0.0)
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _sift(work, depth):  # type: ignore[no-untyped-def]
     """List the boxes of a list that may come nearer to a corner than the point; how many."""
     lists, bound, kept, count = work.lists, work.bound, work.kept, work.counts[depth]
@@ -303,7 +318,7 @@ def _sift(work, depth):  # type: ignore[no-untyped-def]
     return sifted
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _select(work, depth):  # type: ignore[no-untyped-def]
     """Find the boxes of a list that come nearer to a corner than the bound there, which is no
     farther than the point; how many."""
@@ -334,7 +349,7 @@ def _select(work, depth):  # type: ignore[no-untyped-def]
     return used
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _narrow(tree, work, depth):  # type: ignore[no-untyped-def]
     """Find the boxes of a list that can hold the nearest to the block's nodes; how many."""
     number = work.numbers[depth, _closest_middle(work, depth)]
@@ -350,7 +365,7 @@ def _narrow(tree, work, depth):  # type: ignore[no-untyped-def]
     return _select(work, depth)
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _open(tree, work, source, target, count):  # type: ignore[no-untyped-def]
     """Fill a list with what the kept boxes of another, or of the same, hold."""
     boxes, kept = tree.boxes, work.kept
@@ -384,7 +399,7 @@ def _open(tree, work, source, target, count):  # type: ignore[no-untyped-def]
     work.held[target] = work.held[source] - 1
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _copy(work, source, target, count):  # type: ignore[no-untyped-def]
     """Fill a list with the kept boxes of another, or drop the rest of the same."""
     for row in range(work.lists.shape[1]):
@@ -396,7 +411,7 @@ def _copy(work, source, target, count):  # type: ignore[no-untyped-def]
     work.held[target] = work.held[source]
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
     """Make a block's list, at ``depth + 1``, from that of the block around it."""
     source, target = depth, depth + 1
@@ -408,7 +423,7 @@ def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
     _copy(work, source, target, count)
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _open_all(tree, work, depth):  # type: ignore[no-untyped-def]
     """Open a list's boxes that can hold the nearest, down to triangles; where that list is."""
     source = depth
@@ -418,7 +433,7 @@ def _open_all(tree, work, depth):  # type: ignore[no-untyped-def]
     return source
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _list_all(tree, work):  # type: ignore[no-untyped-def]
     """Make the list at depth 0: all boxes of the last level."""
     first = NOUGHT
@@ -431,7 +446,7 @@ def _list_all(tree, work):  # type: ignore[no-untyped-def]
     _open(tree, work, first, first, groups)
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _place(tree, work, axes, corner, size):  # type: ignore[no-untyped-def]
     """Go to the block of ``size`` nodes a side whose first node is ``corner`` (z, y, x)."""
     for k in range(3):
@@ -441,7 +456,7 @@ def _place(tree, work, axes, corner, size):  # type: ignore[no-untyped-def]
         work.middle[k] = axis[0] + corner[2 - k] * step + work.half[k] - tree.centre_mm[k]
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@njit(**UNCOUNTED, forceinline=True)
 def _fill_cube(tree, work, axes, depth, corner, out):  # type: ignore[no-untyped-def]
     """Distances of a cube of 2 x 2 x 2 nodes, each of which is a corner."""
     for lane in range(CORNERS):
@@ -467,7 +482,7 @@ def _fill_cube(tree, work, axes, depth, corner, out):  # type: ignore[no-untyped
                 out[k, j, i] = work.best[4 * (k - z) + 2 * (j - y) + i - x]
 
 
-@njit(nogil=True, cache=True)
+@njit(**UNCOUNTED)
 def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-untyped-def]
     """Unsigned distance, mm, of a block of 32 nodes a side, or what of it is in the grid.
 
@@ -478,9 +493,9 @@ def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-u
     _list_all(tree, work)
     _place(tree, work, axes, (z, y, x), NOUGHT + TOP)
     _enter(tree, work, NOUGHT, levels[0])
-    corners, visited = np.zeros((DEPTHS, 3), np.int64), np.zeros(DEPTHS, np.int64)
-    corners[1, 0], corners[1, 1], corners[1, 2] = z, y, x
-    depth = NOUGHT + 1
+    first, visited, depth = work.first, work.visited, NOUGHT + 1
+    first[depth, 0], first[depth, 1], first[depth, 2] = z, y, x
+    visited[depth] = 0
     while depth > 0:
         part = visited[depth]
         if part == CORNERS:
@@ -488,9 +503,9 @@ def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-u
             continue
         visited[depth] += 1
         size = TOP >> depth
-        z = corners[depth, 0] + size * (part >> 2)
-        y = corners[depth, 1] + size * (part >> 1 & 1)
-        x = corners[depth, 2] + size * (part & 1)
+        z = first[depth, 0] + size * (part >> 2)
+        y = first[depth, 1] + size * (part >> 1 & 1)
+        x = first[depth, 2] + size * (part & 1)
         if z >= out.shape[0] or y >= out.shape[1] or x >= out.shape[2]:
             continue
         _place(tree, work, axes, (z, y, x), size)
@@ -500,4 +515,4 @@ def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-u
         _enter(tree, work, depth, levels[depth])
         depth += 1
         visited[depth] = 0
-        corners[depth, 0], corners[depth, 1], corners[depth, 2] = z, y, x
+        first[depth, 0], first[depth, 1], first[depth, 2] = z, y, x

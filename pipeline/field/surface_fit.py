@@ -50,6 +50,8 @@ MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
 suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
+# A signed place in an array is asked first whether it counts from the end; these are not.
+ONE, TWO = np.uintp(1), np.uintp(2)
 # Minima and maxima aside, only the order of sums may change.
 FAST = {"contract", "nnan", "nsz"}
 
@@ -340,14 +342,14 @@ def _gather(layer, nodes, found):  # type: ignore[no-untyped-def]
         x, (a0, a1, a2) = _weigh(nodes[n, 0])
         y, along_y = _weigh(nodes[n, 1])
         z, along_z = _weigh(nodes[n, 2])
-        plane, value = (z * height + y) * width + x, np.float32(0)
+        plane, value = np.uintp((z * height + y) * width + x), np.float32(0)
         for c in along_z:
             row, line = plane, np.float32(0)
             for b in along_y:
-                line += b * (a0 * values[row] + a1 * values[row + 1] + a2 * values[row + 2])
-                row += width
+                line += b * (a0 * values[row] + a1 * values[row + ONE] + a2 * values[row + TWO])
+                row += np.uintp(width)
             value += c * line
-            plane += height * width
+            plane += np.uintp(height * width)
         found[n] = value
 
 
@@ -355,16 +357,16 @@ def _gather(layer, nodes, found):  # type: ignore[no-untyped-def]
 def _add(target, width, height, first, shares, value):  # type: ignore[no-untyped-def]
     """Add a value to 27 nodes, by the product of three shares."""
     (a0, a1, a2), along_y, along_z = shares
-    plane = first
+    plane = np.uintp(first)
     for c in along_z:
         row, part = plane, value * c
         for b in along_y:
             here = part * b
             target[row] += here * a0
-            target[row + 1] += here * a1
-            target[row + 2] += here * a2
-            row += width
-        plane += height * width
+            target[row + ONE] += here * a1
+            target[row + TWO] += here * a2
+            row += np.uintp(width)
+        plane += np.uintp(height * width)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
