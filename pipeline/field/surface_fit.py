@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
@@ -112,9 +113,16 @@ def fit_to_surface(
         parts = nodes.astype(np.float32), interval, np.array(weights, dtype=np.float32)
         moments.append(_Moment(*parts, near_enough_mm))
     del places
-    near = np.stack([one[box] for one in splines])
-    change = _Fit(near, moments, step_mm).after(rounds)
-    for spline, part in zip(splines, change, strict=True):
+    shape = splines[0][box].shape
+    touched = np.zeros(shape, dtype=bool)
+    for moment in moments:
+        _touch(touched, moment.nodes)
+    shell = np.flatnonzero(touched).astype(np.uint32)
+    near = np.stack([one[box].ravel()[shell] for one in splines])
+    change = _Fit(near, shell, shape, moments, step_mm).after(rounds)
+    for spline, moved in zip(splines, change, strict=True):
+        part = np.zeros(shape, dtype=np.float32)
+        part.ravel()[shell] = moved
         spline[box] += part
     return float(np.abs(change).max())
 
@@ -207,14 +215,24 @@ def _box(points_mm: Sequence[Float], grid: Grid) -> tuple[list[int], list[int]]:
 
 
 class _Fit:
-    """The change that brings coefficients ``(phase, z, y, x)`` to zero at all points."""
+    """The change that brings coefficients to zero at all points.
+
+    Coefficients ``(phase, n)`` are those that some point asks, a shell about the surface: ``shell``
+    are their places in an array of ``shape`` ``(z, y, x)``, flattened.
+    """
 
     def __init__(
-        self, coefficients: Float32, moments: Sequence[_Moment], spacing_mm: float
+        self,
+        coefficients: Float32,
+        shell: npt.NDArray[np.uint32],
+        shape: tuple[int, ...],
+        moments: Sequence[_Moment],
+        spacing_mm: float,
     ) -> None:
         self._moments = moments
+        self._shell = shell
         self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
-        self._layer = np.empty_like(coefficients[0])
+        self._layer, self._acting = np.zeros((2, *shape), dtype=np.float32)
         self._change = np.zeros_like(coefficients)
         self._before = [-one for one in self._values(coefficients)]
         self._off = [one.copy() for one in self._before]
@@ -272,25 +290,23 @@ class _Fit:
         """Down which way the sum of squares falls."""
         slope = np.float32(-DAMPING) * self._change
         for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
-            self._layer[:] = 0
-            _scatter(self._layer, one.nodes, weight * off)
-            _share(slope, one.interval, one.weights, self._layer)
+            _scatter(self._acting, one.nodes, weight * off)
+            _share(slope, one.interval, one.weights, self._acting, self._shell)
         return slope
 
     def _scale(self) -> Float32:
         """One over the diagonal of the normal equations."""
         diagonal = np.full_like(self._change, np.float32(DAMPING))
         for one, weight in zip(self._moments, self._weights, strict=True):
-            self._layer[:] = 0
-            _scatter_squares(self._layer, one.nodes, weight)
-            _share(diagonal, one.interval, one.weights**2, self._layer)
+            _scatter_squares(self._acting, one.nodes, weight)
+            _share(diagonal, one.interval, one.weights**2, self._acting, self._shell)
         return np.asarray(np.float32(1) / diagonal)
 
     def _values(self, coefficients: Float32) -> list[Float32]:
         """Interpolated distances at all points."""
         values = []
         for one in self._moments:
-            _mix(coefficients, one.interval, one.weights, self._layer)
+            _mix(coefficients, one.interval, one.weights, self._layer, self._shell)
             found = np.empty(len(one.nodes), dtype=np.float32)
             _gather(self._layer, one.nodes, found)
             values.append(found)
@@ -303,24 +319,29 @@ def _product(one: Float32, other: Float32) -> float:
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def _mix(coefficients, interval, weights, layer):  # type: ignore[no-untyped-def]
+def _mix(coefficients, interval, weights, layer, shell):  # type: ignore[no-untyped-def]
     """Coefficients at one moment: those of three phases, weighted."""
     count, into = len(coefficients), layer.ravel()
-    before = coefficients[(interval - 1) % count].ravel()
-    at, after = coefficients[interval].ravel(), coefficients[(interval + 1) % count].ravel()
+    before = coefficients[(interval - 1) % count]
+    at, after = coefficients[interval], coefficients[(interval + 1) % count]
     early, middle, late = weights[0], weights[1], weights[2]
-    for n in range(len(into)):
-        into[n] = early * before[n] + middle * at[n] + late * after[n]
+    for n in range(len(shell)):
+        into[shell[n]] = early * before[n] + middle * at[n] + late * after[n]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
-def _share(target, interval, weights, layer):  # type: ignore[no-untyped-def]
-    """Add what acts at one moment to three phases, by their weights."""
-    count, given = len(target), layer.ravel()
-    for step in range(3):
-        phase, weight = target[(interval + step - 1) % count].ravel(), weights[step]
-        for n in range(len(given)):
-            phase[n] += weight * given[n]
+def _share(target, interval, weights, acting, shell):  # type: ignore[no-untyped-def]
+    """Add what acts at one moment to three phases, by their weights; nothing acts any more."""
+    count, given = len(target), acting.ravel()
+    before = target[(interval - 1) % count]
+    at, after = target[interval], target[(interval + 1) % count]
+    early, middle, late = weights[0], weights[1], weights[2]
+    for n in range(len(shell)):
+        one = given[shell[n]]
+        given[shell[n]] = 0
+        before[n] += early * one
+        at[n] += middle * one
+        after[n] += late * one
 
 
 @njit(nogil=True, cache=True, fastmath=FAST, inline="always")
@@ -331,6 +352,19 @@ def _weigh(place):  # type: ignore[no-untyped-def]
     t = place - np.float32(middle)
     early, late = half - t, half + t
     return middle - 1, (half * early * early, np.float32(0.75) - t * t, half * late * late)
+
+
+@njit(nogil=True, cache=True, fastmath=FAST)
+def _touch(touched, nodes):  # type: ignore[no-untyped-def]
+    """Mark the nodes that points ask."""
+    for n in range(len(nodes)):
+        x, _ = _weigh(nodes[n, 0])
+        y, _ = _weigh(nodes[n, 1])
+        z, _ = _weigh(nodes[n, 2])
+        for c in range(3):
+            for b in range(3):
+                for a in range(3):
+                    touched[z + c, y + b, x + a] = True
 
 
 @njit(nogil=True, cache=True, fastmath=FAST)
