@@ -415,11 +415,12 @@ def _copy(work, source, target, count):  # type: ignore[no-untyped-def]
 def _enter(tree, work, depth, level):  # type: ignore[no-untyped-def]
     """Make a block's list, at ``depth + 1``, from that of the block around it."""
     source, target = depth, depth + 1
-    count = _narrow(tree, work, source)
-    while work.held[source] > level:
+    while True:
+        count = _narrow(tree, work, source)
+        if work.held[source] <= level:
+            break
         _open(tree, work, source, target, count)
         source = target
-        count = _narrow(tree, work, source)
     _copy(work, source, target, count)
 
 
@@ -491,16 +492,17 @@ def block_distance(tree, work, levels, axes, z, y, x, out):  # type: ignore[no-u
     in depth, so that one list a depth is in use.
     """
     _list_all(tree, work)
-    _place(tree, work, axes, (z, y, x), NOUGHT + TOP)
-    _enter(tree, work, NOUGHT, levels[0])
-    first, visited, depth = work.first, work.visited, NOUGHT + 1
+    first, visited, depth = work.first, work.visited, NOUGHT
     first[depth, 0], first[depth, 1], first[depth, 2] = z, y, x
+    # The block is the first part, and the only one, of what is around it.
     visited[depth] = 0
-    while depth > 0:
+    while True:
         part = visited[depth]
         if part == CORNERS:
             depth -= 1
             continue
+        if depth == 0 and part > 0:
+            break
         visited[depth] += 1
         size = TOP >> depth
         z = first[depth, 0] + size * (part >> 2)
