@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -63,6 +64,25 @@ def fetch(typing_context: Any, address: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(types.uintp), generate
+
+
+def place_of(n: int) -> Any:
+    """The number of an element of a vector."""
+    return ir.Constant(ir.IntType(32), n)
+
+
+def spread(builder: Any, number: Any) -> Any:
+    """A vector of a number four times."""
+    four = ir.Constant(ir.VectorType(number.type, 4), ir.Undefined)
+    for n in range(4):
+        four = builder.insert_element(four, number, place_of(n))
+    return four
+
+
+def mixed(builder: Any, weights: Any, parts: Any, flags: tuple[str, ...]) -> Any:
+    """Weighted sum of numbers or vectors, added in their order."""
+    products = [builder.fmul(a, b, flags=flags) for a, b in zip(weights, parts, strict=True)]
+    return functools.reduce(lambda a, b: builder.fadd(a, b, flags=flags), products)
 
 
 @cache

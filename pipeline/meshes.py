@@ -17,7 +17,7 @@ MESH_ENDINGS = (".vtp", ".stl", ".ply")
 
 # Room for the notes that begin a file.
 _STL_NOTES_BYTES, _NOTES_BYTES = 80, 4096
-_VTP_NUMBER = re.compile(rb'\bNumberOf(\w+)\s*=\s*"([^"]*)"')
+_VTP_NUMBER = re.compile(rb'NumberOf(\w+)\s*=\s*"([^"]*)"')
 _MOST_COMPONENTS = 64
 # Bytes that one packed byte may become, at most.
 _PACKED = 1032
@@ -83,8 +83,10 @@ def _what_bounds(vertices: Float, triangles: Integer) -> tuple[Float, Integer]:
     that correspond through the phases still do."""
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
-    used, numbers = np.unique(triangles, return_inverse=True)
-    return vertices[used], numbers.reshape(triangles.shape)
+    used = np.zeros(len(vertices), dtype=bool)
+    used[triangles] = True
+    numbers = np.cumsum(used) - 1
+    return vertices[used], numbers[triangles]
 
 
 def _in_lps(vertices_mm: Float, path: Path, mesh: Any) -> Float:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import pyvista
 from field_baked import FIXTURES, RR_S, SETTINGS, bake_small
-from field_shapes import beating, box, sphere
+from field_shapes import beating, box, lumpy, sphere
 
 from data_synth.population import draw_heart
 from pipeline.config import Settings
@@ -16,9 +16,12 @@ from pipeline.exact import points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
+from pipeline.field.distance import distance_of_closed
 from pipeline.field.motion import Motion
+from pipeline.field.spline import space_coefficients
+from pipeline.field.surface_fit import fit_to_surface
 from pipeline.field.verify import verify_field
-from pipeline.geometry import MovingSurface, Surface
+from pipeline.geometry import Grid, MovingSurface, Surface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
@@ -243,6 +246,21 @@ def test_the_fit_spoils_nothing_beside_a_part_of_the_beat_that_no_phase_shows(tm
     # What the fit costs an even beat: gradients a few hundredths steeper, a few millimetres off.
     assert errors[1] < errors[0] + 0.1
     assert gaps_mm[1] < gaps_mm[0] + 0.1
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 17])
+def test_the_fit_is_the_same_by_any_number_of_threads(count):
+    """Many points, so that threads which wrote to the same phase would get in each other's way."""
+    phases = np.arange(count) / count
+    ball = beating(lumpy(3, level=4), 1 - 0.2 * np.sin(np.pi * phases) ** 2, phases)
+    grid = Grid((28, 28, 28), (-54.0,) * 3, (4.0,) * 3)
+    stored = [space_coefficients(distance_of_closed(ball.at(k), grid)) for k in range(count)]
+    fitted = {}
+    for threads in (1, 2, 8):
+        splines = [one.astype(np.float32) for one in stored]
+        assert fit_to_surface(splines, phases, grid, ball, 3, threads) > 0.1
+        fitted[threads] = np.stack(splines).tobytes()
+    assert fitted[1] == fitted[2] == fitted[8]
 
 
 def test_what_rests_beside_what_moves_is_measured_anew(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from pipeline.field.reader import ForceField
 from pipeline.field.spline import space_coefficients
 from pipeline.field.store import FieldWriter
 from pipeline.field.surface_fit import fit_to_surface
-from pipeline.field.threads import processors
 from pipeline.geometry import Float, Float32, Grid, Surface, require_rigid
 from pipeline.progress import Progress
 
@@ -148,14 +146,15 @@ def _fit(
     """Bring the splines' zeros to the surfaces; the description with what that changed."""
     phases = np.array(metadata.phases)
 
-    def correct(name: str) -> float:
-        return fit_to_surface(writer.splines(name), phases, grid, surfaces[name], rounds)
-
-    with ThreadPoolExecutor(processors()) as pool:
-        changes = list(pool.map(correct, surfaces))
     structures = {
-        name: part.model_copy(update={"correction_mm": change})
-        for (name, part), change in zip(metadata.structures.items(), changes, strict=True)
+        name: part.model_copy(
+            update={
+                "correction_mm": fit_to_surface(
+                    writer.splines(name), phases, grid, surfaces[name], rounds
+                )
+            }
+        )
+        for name, part in metadata.structures.items()
     }
     return metadata.model_copy(update={"structures": structures})
 

@@ -59,7 +59,8 @@ def certify(
     Largest errors over all, and per structure and fixture.
     """
     distances: dict[str, list[dict[str, Any]]] = {name: [] for name in volume.structures}
-    forces = {name: _ForceSteps(volume, name, surfaces) for name in volume.fixtures}
+    nodes_mm = volume.grid.nodes_mm().reshape(-1, 3)
+    forces = {name: _ForceSteps(volume, name, surfaces, nodes_mm) for name in volume.fixtures}
     with ThreadPoolExecutor(processors()) as pool:
         for index in range(len(volume.phases)):
             steps = [pool.submit(one.add, index) for one in forces.values()]
@@ -264,9 +265,14 @@ class _ForceSteps:
     """Largest steps of one fixture's force, gathered phase by phase in their order."""
 
     def __init__(
-        self, volume: ForceField, name: str, surfaces: Mapping[str, BeatingSurface]
+        self,
+        volume: ForceField,
+        name: str,
+        surfaces: Mapping[str, BeatingSurface],
+        nodes_mm: Float,
     ) -> None:
         self._volume = volume
+        self._nodes_mm = nodes_mm
         self._name = name
         self._fixture = volume.fixtures[name]
         self._surface = surfaces[self._fixture.structure]
@@ -293,10 +299,8 @@ class _ForceSteps:
         self._sampled.append(self._sample(index))
 
     def _forces(self, index: int) -> Float:
-        grid = self._volume.grid
-        nodes_mm = grid.nodes_mm().reshape(-1, 3)
-        phase = self._volume.phases[index]
-        return self._volume.force_n(nodes_mm, phase, self._name).reshape(*grid.shape, 3)
+        force_n = self._volume.force_n(self._nodes_mm, self._volume.phases[index], self._name)
+        return force_n.reshape(*self._volume.grid.shape, 3)
 
     def _sample(self, index: int) -> _Sampled:
         """Changes of force over 0.1 mm and over 1 ms, between this phase and the next."""

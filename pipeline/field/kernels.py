@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-from pipeline.compiled import door, fetch
+from pipeline.compiled import door, fetch, mixed, place_of, spread
 from pipeline.field import potential as formulas
 
 # The compiled code calls the very functions that NumPy users call.
@@ -53,30 +53,11 @@ _FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)
 _FOUR = ir.VectorType(ir.DoubleType(), 4)
 
 
-def _place_of(n: int) -> Any:
-    return ir.Constant(ir.IntType(32), n)
-
-
-def _spread(builder: Any, number: Any) -> Any:
-    """A number four times."""
-    four = ir.Constant(_FOUR, ir.Undefined)
-    for n in range(4):
-        four = builder.insert_element(four, number, _place_of(n))
-    return four
-
-
 def _nodes(builder: Any, address: Any, row: Any) -> Any:
     """Four float32 numbers from number ``row`` after an address on, as float64."""
     start = builder.add(address, builder.shl(row, ir.Constant(row.type, 2)))
     singles = builder.load(builder.inttoptr(start, _FOUR_SINGLE.as_pointer()), align=4)
     return builder.fpext(singles, _FOUR)
-
-
-def _mixed(builder: Any, weights: Any, parts: Any) -> Any:
-    """Weighted sum; products and sums are fused where the processor can."""
-    fused = tuple(CONTRACT)
-    products = [builder.fmul(a, b, flags=fused) for a, b in zip(weights, parts, strict=True)]
-    return functools.reduce(lambda a, b: builder.fadd(a, b, flags=fused), products)
 
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba has no types
@@ -98,23 +79,24 @@ def _sum(typing_context: Any, phases: Any, rows: Any, weights: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         p, starts, w = (cgutils.unpack_tuple(builder, argument) for argument in arguments)
-        mixed = functools.partial(_mixed, builder)
+        # Products and sums are fused where the processor can.
+        sum_of = functools.partial(mixed, builder, flags=tuple(CONTRACT))
         wx, sx = w[3:7], w[13:17]
         time, wy, wz, sy, sz = (
-            [_spread(builder, one) for one in part]
+            [spread(builder, one) for one in part]
             for part in (w[:3], w[7:10], w[10:13], w[17:20], w[20:])
         )
         planes, slopes = [], []
         for c in range(0, 9, 3):
             lines = [
-                mixed(time, [_nodes(builder, one, start) for one in p])
+                sum_of(time, [_nodes(builder, one, start) for one in p])
                 for start in starts[c : c + 3]
             ]
-            planes.append(mixed(wy, lines))
-            slopes.append(mixed(sy, lines))
-        value, along_y, along_z = mixed(wz, planes), mixed(wz, slopes), mixed(sz, planes)
+            planes.append(sum_of(wy, lines))
+            slopes.append(sum_of(sy, lines))
+        value, along_y, along_z = sum_of(wz, planes), sum_of(wz, slopes), sum_of(sz, planes)
         found = [
-            mixed(along, [builder.extract_element(row, _place_of(n)) for n in range(4)])
+            sum_of(along, [builder.extract_element(row, place_of(n)) for n in range(4)])
             for along, row in ((wx, value), (sx, value), (wx, along_y), (wx, along_z))
         ]
         return context.make_tuple(builder, signature.return_type, found)

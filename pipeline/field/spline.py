@@ -20,19 +20,34 @@ def space_coefficients(values: Float) -> Float:
     the coefficients go on in a straight line, which makes the first and the last coefficient
     the value itself.
     """
-    from scipy.linalg import solve_banded
-
     coefficients = np.array(values, dtype=np.float64)
-    for axis in range(3):
-        lines = np.moveaxis(coefficients, axis, 0)
-        count = len(lines)
-        bands = np.empty((3, count))
-        bands[0], bands[1], bands[2] = 0.125, 0.75, 0.125
-        bands[1, [0, -1]] = 1.0
-        bands[0, 1] = bands[2, -2] = 0.0
-        solved = solve_banded((1, 1), bands, lines.reshape(count, -1), check_finite=False)
-        coefficients = np.moveaxis(solved.reshape(lines.shape), 0, axis)
-    return np.ascontiguousarray(coefficients)
+    _solve(coefficients)
+    _solve(coefficients.swapaxes(0, 1))
+    # Whole planes are solved for at once, and whole lines of memory at that.
+    turned = np.ascontiguousarray(coefficients.transpose(2, 0, 1))
+    _solve(turned)
+    return np.ascontiguousarray(turned.transpose(1, 2, 0))
+
+
+def _solve(values: Float) -> None:
+    """Turn values into coefficients along the first axis, in place.
+
+    Gauss elimination of three diagonals (Golub, Van Loan, Matrix Computations, section 4.3); each
+    row is dominated by its diagonal, so none need change places.
+    """
+    last = len(values) - 1
+    diagonal = np.full(last + 1, 0.75)
+    diagonal[[0, last]] = 1.0
+    part = np.empty_like(values[0])
+    # Above and below the first and the last there is nothing.
+    for row in range(1, last):
+        above = 0.125 if row > 1 else 0.0
+        share = 0.125 / diagonal[row - 1]
+        diagonal[row] -= share * above
+        values[row] -= np.multiply(values[row - 1], share, out=part)
+    for row in range(last - 1, 0, -1):
+        values[row] -= np.multiply(values[row + 1], 0.125, out=part)
+        values[row] /= diagonal[row]
 
 
 def node_values(coefficients: Float) -> Float:

@@ -15,15 +15,20 @@ point weighs by the inverse of its variance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+import threading
+from collections.abc import Callable, Iterator, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.field.fit_kernels import gather, mix, room, scatter, scatter_squares, share, touch
 from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
 from pipeline.field.spline import phase_weights, timeline
+from pipeline.field.threads import processors
 from pipeline.geometry import (
     Float,
     Float32,
@@ -33,6 +38,8 @@ from pipeline.geometry import (
     area_vectors,
     spread_over_triangle,
 )
+
+T = TypeVar("T")
 
 MOMENTS_A_PHASE = 3
 POINTS_A_CELL = 2.0
@@ -51,10 +58,6 @@ MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
 suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
-# A signed place in an array is asked first whether it counts from the end; these are not.
-ONE, TWO = np.uintp(1), np.uintp(2)
-# Minima and maxima aside, only the order of sums may change.
-FAST = {"contract", "nnan", "nsz"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +78,16 @@ class _Moment:
 
 
 def fit_to_surface(
-    splines: Sequence[Float32], phases: Float, grid: Grid, moving: BeatingSurface, rounds: int
+    splines: Sequence[Float32],
+    phases: Float,
+    grid: Grid,
+    moving: BeatingSurface,
+    rounds: int,
+    threads: int | None = None,
 ) -> float:
     """Correct the coefficients of one structure in place.
+
+    The result does not depend on the number of threads.
 
     Parameters
     ----------
@@ -91,6 +101,8 @@ def fit_to_surface(
         The surface, LPS mm.
     rounds
         How often the weights of the points are set; nothing is changed when 0.
+    threads
+        How many; as many as there are processors when None.
 
     Returns
     -------
@@ -116,10 +128,11 @@ def fit_to_surface(
     shape = splines[0][box].shape
     touched = np.zeros(shape, dtype=bool)
     for moment in moments:
-        _touch(touched, moment.nodes)
+        touch(touched, moment.nodes)
     shell = np.flatnonzero(touched).astype(np.uint32)
     near = np.stack([one[box].ravel()[shell] for one in splines])
-    change = _Fit(near, shell, shape, moments, step_mm).after(rounds)
+    with ThreadPoolExecutor(threads or processors()) as pool:
+        change = _Fit(near, shell, shape, moments, step_mm, pool).after(rounds)
     for spline, moved in zip(splines, change, strict=True):
         part = np.zeros(shape, dtype=np.float32)
         part.ravel()[shell] = moved
@@ -214,6 +227,13 @@ def _box(points_mm: Sequence[Float], grid: Grid) -> tuple[list[int], list[int]]:
     return low.tolist(), high.tolist()
 
 
+class _Layers(threading.local):
+    """What each thread has for itself, ``(z, y, x)``."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.mixed, self.acting = room(shape), room(shape)
+
+
 class _Fit:
     """The change that brings coefficients to zero at all points.
 
@@ -228,11 +248,14 @@ class _Fit:
         shape: tuple[int, ...],
         moments: Sequence[_Moment],
         spacing_mm: float,
+        pool: ThreadPoolExecutor,
     ) -> None:
         self._moments = moments
+        self._runs = _runs([one.interval for one in moments], len(coefficients))
+        self._pool = pool
+        self._layers = _Layers(shape)
         self._shell = shell
         self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
-        self._layer, self._acting = np.zeros((2, *shape), dtype=np.float32)
         self._change = np.zeros_like(coefficients)
         self._before = [-one for one in self._values(coefficients)]
         self._off = [one.copy() for one in self._before]
@@ -265,168 +288,102 @@ class _Fit:
     def _least_squares(self) -> None:
         """A few steps down the sum of squares."""
         scale = self._scale()
-        slope = self._slope()
-        way = scale * slope
-        length2 = _product(slope, way)
+        slope, way = np.zeros_like(scale), np.zeros_like(scale)
+        length2 = math.inf
+
+        def rise(phase: int) -> float:
+            return _product(slope[phase], scale[phase] * slope[phase])
+
+        def turn(phase: int) -> float:
+            way[phase] *= kept
+            way[phase] += scale[phase] * slope[phase]
+            return _product(way[phase], way[phase])
+
+        def move(phase: int) -> None:
+            self._change[phase] += step * way[phase]
+
+        def curving(number: int) -> float:
+            return _product(self._weights[number] * along[number], along[number])
+
+        def approach(number: int) -> None:
+            self._off[number] -= step * along[number]
+
         for _ in range(STEPS_A_ROUND):
+            self._find_slope(slope)
+            before, length2 = length2, sum(self._of_each(rise, self._change))
+            kept = np.float32(length2 / before)
+            curvature = DAMPING * sum(self._of_each(turn, way))
             along = self._values(way)
-            pairs = zip(self._weights, along, strict=True)
-            curvature = DAMPING * _product(way, way)
-            curvature += sum(_product(weight * one, one) for weight, one in pairs)
+            curvature += sum(self._of_each(curving, along))
             # Nothing is left to do on a surface that the spline already has.
             if curvature == 0:
                 break
             step = np.float32(length2 / curvature)
-            self._change += step * way
-            for off, one in zip(self._off, along, strict=True):
-                off -= step * one
-            slope = self._slope()
-            down = scale * slope
-            before, length2 = length2, _product(slope, down)
-            way *= np.float32(length2 / before)
-            way += down
+            self._of_each(move, way)
+            self._of_each(approach, along)
 
-    def _slope(self) -> Float32:
+    def _find_slope(self, slope: Float32) -> None:
         """Down which way the sum of squares falls."""
-        slope = np.float32(-DAMPING) * self._change
-        for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
-            _scatter(self._acting, one.nodes, weight * off)
-            _share(slope, one.interval, one.weights, self._acting, self._shell)
-        return slope
+        np.multiply(self._change, np.float32(-DAMPING), out=slope)
+
+        def add(number: int) -> None:
+            one, acting = self._moments[number], self._layers.acting
+            scatter(acting, one.nodes, self._weights[number] * self._off[number])
+            share(slope, one.interval, one.weights, acting, self._shell)
+
+        self._for_all(add)
 
     def _scale(self) -> Float32:
         """One over the diagonal of the normal equations."""
         diagonal = np.full_like(self._change, np.float32(DAMPING))
-        for one, weight in zip(self._moments, self._weights, strict=True):
-            _scatter_squares(self._acting, one.nodes, weight)
-            _share(diagonal, one.interval, one.weights**2, self._acting, self._shell)
+
+        def add(number: int) -> None:
+            one, acting = self._moments[number], self._layers.acting
+            scatter_squares(acting, one.nodes, self._weights[number])
+            share(diagonal, one.interval, one.weights**2, acting, self._shell)
+
+        self._for_all(add)
         return np.asarray(np.float32(1) / diagonal)
 
     def _values(self, coefficients: Float32) -> list[Float32]:
         """Interpolated distances at all points."""
-        values = []
-        for one in self._moments:
-            _mix(coefficients, one.interval, one.weights, self._layer, self._shell)
-            found = np.empty(len(one.nodes), dtype=np.float32)
-            _gather(self._layer, one.nodes, found)
-            values.append(found)
+        values = [np.empty(len(one.nodes), dtype=np.float32) for one in self._moments]
+
+        def ask(number: int) -> None:
+            one, mixed = self._moments[number], self._layers.mixed
+            mix(coefficients, one.interval, one.weights, mixed, self._shell)
+            gather(mixed, one.nodes, values[number])
+
+        self._for_all(ask)
         return values
+
+    def _of_each(self, work: Callable[[int], T], ones: Sized) -> list[T]:
+        """What some work gives for each of them, by its number, several at a time."""
+        return list(self._pool.map(work, range(len(ones))))
+
+    def _for_all(self, work: Callable[[int], None]) -> None:
+        """Do something with every moment, by its number, several at a time; what it adds to
+        phases is added in the same order however many threads there are."""
+
+        def through(run: Sequence[int]) -> None:
+            for number in run:
+                work(number)
+
+        # Every second run: no two of them share a phase.
+        for some in (self._runs[::2], self._runs[1::2]):
+            list(self._pool.map(through, some))
+
+
+def _runs(intervals: Sequence[int], phases: int) -> list[list[int]]:
+    """Numbers of moments in runs of neighbouring intervals, an even number of runs and
+    two intervals or more in each: a moment acts on the phases beside its own too."""
+    count = max(1, phases // 4) * 2
+    runs: list[list[int]] = [[] for _ in range(count)]
+    for number, interval in enumerate(intervals):
+        runs[interval * count // phases].append(number)
+    return runs
 
 
 def _product(one: Float32, other: Float32) -> float:
     # A product by BLAS would be summed in an order that depends on its threads.
     return float(np.multiply(one, other).sum(dtype=float))
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _mix(coefficients, interval, weights, layer, shell):  # type: ignore[no-untyped-def]
-    """Coefficients at one moment: those of three phases, weighted."""
-    count, into = len(coefficients), layer.ravel()
-    before = coefficients[(interval - 1) % count]
-    at, after = coefficients[interval], coefficients[(interval + 1) % count]
-    early, middle, late = weights[0], weights[1], weights[2]
-    for n in range(len(shell)):
-        into[shell[n]] = early * before[n] + middle * at[n] + late * after[n]
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _share(target, interval, weights, acting, shell):  # type: ignore[no-untyped-def]
-    """Add what acts at one moment to three phases, by their weights; nothing acts any more."""
-    count, given = len(target), acting.ravel()
-    before = target[(interval - 1) % count]
-    at, after = target[interval], target[(interval + 1) % count]
-    early, middle, late = weights[0], weights[1], weights[2]
-    for n in range(len(shell)):
-        one = given[shell[n]]
-        given[shell[n]] = 0
-        before[n] += early * one
-        at[n] += middle * one
-        after[n] += late * one
-
-
-@njit(nogil=True, cache=True, fastmath=FAST, inline="always")
-def _weigh(place):  # type: ignore[no-untyped-def]
-    """First of the three nodes about a place on an axis, and their weights."""
-    half = np.float32(0.5)
-    middle = int(place + half)
-    t = place - np.float32(middle)
-    early, late = half - t, half + t
-    return middle - 1, (half * early * early, np.float32(0.75) - t * t, half * late * late)
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _touch(touched, nodes):  # type: ignore[no-untyped-def]
-    """Mark the nodes that points ask."""
-    for n in range(len(nodes)):
-        x, _ = _weigh(nodes[n, 0])
-        y, _ = _weigh(nodes[n, 1])
-        z, _ = _weigh(nodes[n, 2])
-        for c in range(3):
-            for b in range(3):
-                for a in range(3):
-                    touched[z + c, y + b, x + a] = True
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _gather(layer, nodes, found):  # type: ignore[no-untyped-def]
-    """Interpolated distances at points of one moment."""
-    height, width = layer.shape[1], layer.shape[2]
-    values = layer.ravel()
-    for n in range(len(nodes)):
-        x, (a0, a1, a2) = _weigh(nodes[n, 0])
-        y, along_y = _weigh(nodes[n, 1])
-        z, along_z = _weigh(nodes[n, 2])
-        plane, value = np.uintp((z * height + y) * width + x), np.float32(0)
-        for c in along_z:
-            row, line = plane, np.float32(0)
-            for b in along_y:
-                line += b * (a0 * values[row] + a1 * values[row + ONE] + a2 * values[row + TWO])
-                row += np.uintp(width)
-            value += c * line
-            plane += np.uintp(height * width)
-        found[n] = value
-
-
-@njit(nogil=True, cache=True, fastmath=FAST, inline="always")
-def _add(target, width, height, first, shares, value):  # type: ignore[no-untyped-def]
-    """Add a value to 27 nodes, by the product of three shares."""
-    (a0, a1, a2), along_y, along_z = shares
-    plane = np.uintp(first)
-    for c in along_z:
-        row, part = plane, value * c
-        for b in along_y:
-            here = part * b
-            target[row] += here * a0
-            target[row + ONE] += here * a1
-            target[row + TWO] += here * a2
-            row += np.uintp(width)
-        plane += np.uintp(height * width)
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _scatter(layer, nodes, values):  # type: ignore[no-untyped-def]
-    """Add to every coefficient the values of the points that it acts on, by its weight there."""
-    height, width = layer.shape[1], layer.shape[2]
-    target = layer.ravel()
-    for n in range(len(nodes)):
-        x, wx = _weigh(nodes[n, 0])
-        y, wy = _weigh(nodes[n, 1])
-        z, wz = _weigh(nodes[n, 2])
-        _add(target, width, height, (z * height + y) * width + x, (wx, wy, wz), values[n])
-
-
-@njit(nogil=True, cache=True, fastmath=FAST)
-def _scatter_squares(layer, nodes, values):  # type: ignore[no-untyped-def]
-    """The same by the squares of the weights."""
-    height, width = layer.shape[1], layer.shape[2]
-    target = layer.ravel()
-    for n in range(len(nodes)):
-        x, (a0, a1, a2) = _weigh(nodes[n, 0])
-        y, (b0, b1, b2) = _weigh(nodes[n, 1])
-        z, (c0, c1, c2) = _weigh(nodes[n, 2])
-        squares = (
-            (a0 * a0, a1 * a1, a2 * a2),
-            (b0 * b0, b1 * b1, b2 * b2),
-            (c0 * c0, c1 * c1, c2 * c2),
-        )
-        _add(target, width, height, (z * height + y) * width + x, squares, values[n])
