@@ -407,3 +407,77 @@ def test_leads_lost_after_a_beat_are_not_forgotten_with_it():
     clock.take_back()
     clock.beat(6.9)
     assert not clock.at(7.03).valid
+
+
+def test_pulses_too_near_for_beats_are_no_rhythm():
+    """0.17 s apart, as of a pacemaker that runs away."""
+    beats = regular(15)
+    burst = beats[-1] + 0.17 * np.arange(1, 21)
+    said, _ = follow(np.concatenate([beats, burst]), burst[-1])
+    assert not said[said[:, 0] > burst[0] + KNOWN_S + TICK_S, 3].any()
+
+
+def test_no_valid_phase_is_less_sure_than_a_twentieth_of_a_beat():
+    r_times_s = np.cumsum(0.8 * (1 + 0.06 * np.random.default_rng(0).normal(size=100)))
+    said, _ = follow(r_times_s, r_times_s[-1])
+    assert 0.045 < said[said[:, 3] > 0, 2].max() <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("off", "valid_before", "valid"),
+    [(0.019, False, True), (0.022, False, False), (0.045, True, True), (0.055, True, False)],
+)
+def test_how_far_off_a_valid_phase_may_be(off, valid_before, valid):
+    """It becomes valid within a fiftieth of a beat, and stays so within a twentieth."""
+    clock = PhaseClock(0.8)
+    for k in range(20):
+        clock.beat(0.8 * k)
+    for k in range(25):
+        clock.at(15.3 + 0.001 * k)
+    state = clock._state
+    state[ticks.PHASE] += off
+    state[ticks.VALID], state[ticks.FADE] = valid_before, 1.0
+    assert clock.at(15.324).valid == valid
+
+
+@pytest.mark.parametrize(("step", "disorder"), [(0.065, False), (0.085, True)])
+def test_how_large_a_step_is_disorder(step, disorder):
+    """Three lengths in turn: two of three steps, to either beat before, are that share."""
+    clock = PhaseClock(0.8)
+    r_times_s = np.cumsum(np.tile(0.8 + 0.8 * step * np.array([-1, 0, 1]), 8))
+    for one in r_times_s:
+        clock.beat(one)
+    assert (clock.at(r_times_s[-1] + 0.1).state == "fibrillating") == disorder
+
+
+def test_how_many_even_beats_end_a_habit_of_surprises():
+    clock, valid = PhaseClock(0.8), []
+    for one in np.cumsum([0.52, 1.08] * 12 + [0.8] * 12):
+        clock.beat(one)
+        valid.append(clock.at(one + 0.14).valid)
+    assert not any(valid[2:24])
+    # Six intervals, the first of which ends what was uneven.
+    assert valid[24:].index(True) == 7
+
+
+@pytest.mark.parametrize(("off", "speed"), [(-0.1, 1.5), (0.1, 0.5)])
+def test_how_fast_a_phase_is_corrected(off, speed):
+    clock = PhaseClock(0.8)
+    for k in range(20):
+        clock.beat(0.8 * k)
+    clock.at(15.4)
+    clock._state[ticks.PHASE] += off
+    clock._state[ticks.FADE] = 1.0
+    before = clock.tick.phase
+    assert clock.at(15.41).phase - before == pytest.approx(speed * 0.01 / 0.8)
+
+
+def test_fibrillation_ends_after_three_even_intervals():
+    clock, states = PhaseClock(0.8), []
+    disorder = np.tile(0.8 + 0.08 * np.array([-1, 0, 1]), 6)
+    for r_s in np.cumsum([*disorder, *[0.8] * 12]):
+        clock.beat(r_s)
+        states.append(clock.at(r_s + 0.14).state)
+    assert states[17] == "fibrillating"
+    # Two thirds of the last nine steps are small from the third even interval on.
+    assert states[18:].index("regular") == 5

@@ -49,7 +49,7 @@ def stream(rng: np.random.Generator) -> np.ndarray:
         if mood == 5:
             rows.append((1, now_s - rng.choice([5.0, 0.015, 0.025]), True))
         if mood == 11 and rng.random() < 0.3:
-            rows.append((1, rng.choice([np.nan, np.inf, 1.7e308, now_s + 900.0]), True))
+            rows.append((1, rng.choice([np.nan, np.inf, 1.7e308, 5e11, now_s + 900.0]), True))
         if mood == 7:
             rows.append((0, r_s + 1000.0, False))
         if mood == 9:
@@ -65,6 +65,10 @@ def stream(rng: np.random.Generator) -> np.ndarray:
             rows += [(0, r_s + k * rng.choice([0.005, 0.1, 0.18]), False) for k in range(1, 5)]
         if mood == 10:
             rows.append((0, now_s + rng.choice([0.015, 0.025, 0.4, 1.0]), False))
+        if mood == 15:
+            rows += [(0, now_s + 2.9, False), (0, now_s + 5.5, False)]
+        if mood == 16:
+            rows += [(0, r_s + 0.1, False), (1, now_s, False), (2, r_s, False)]
         r_s += step_s
     return np.array(rows, dtype=float)
 
@@ -117,14 +121,15 @@ NEVER_VALID = r"""
 int main(void)
 {
     const double wrong[][2] = {{0.0, 5.0}, {800.0, 5.0}, {NAN, 5.0}, {0.8, -5.0}, {0.8, 0.0},
-                               {0.8, INFINITY}, {0.8, NAN}, {0.8, 5.0}, {0.8, 5.0}};
+                               {0.8, INFINITY}, {0.8, NAN}, {0.19, 5.0}, {0.8, 5.0},
+                               {0.8, 5.0}};
     int n, k;
-    for (n = 0; n < 9; n++) {
+    for (n = 0; n < 10; n++) {
         bf_clock clock = bf_new_clock(wrong[n][0], wrong[n][1]);
         bf_tick tick;
         double most = 0, least = 0;
         int valid = 0, sound = 1;
-        if (n == 8) clock.latency_s = 140.0; /* milliseconds */
+        if (n == 9) clock.latency_s = 1.01; /* nobody waits so long for a beat */
         for (k = 0; k < 20000; k++) {
             if (k % 800 == 130) bf_beat(&clock, 0.001 * (k - 130), 0);
             bf_now(&clock, 0.001 * k, 1, &tick);
@@ -153,8 +158,8 @@ def test_a_clock_of_nonsense_is_never_valid_and_renders_nothing(tmp_path):
     (tmp_path / "wrong.c").write_text(NEVER_VALID)
     program = build(tmp_path / "wrong.c", tmp_path / "wrong", "-std=c99", *SANITIZE)
     said = subprocess.run([program], capture_output=True, check=True, text=True).stdout.split("\n")
-    assert said[:7] == ["0 1 0 0"] * 7
-    assert said[7:9] == ["1 1 0 1", "0 1 0 0"]
+    assert said[:8] == ["0 1 0 0"] * 8
+    assert said[8:10] == ["1 1 0 1", "0 1 0 0"]
 
 
 def test_a_compiler_that_takes_no_numbers_for_numbers_is_refused(tmp_path):

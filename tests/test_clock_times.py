@@ -235,3 +235,12 @@ def test_a_field_changes_while_nothing_is_rendered_and_the_rhythm_is_kept():
     assert tick.fade == pytest.approx(10.0 / 4.0 * TICK_S)
     with pytest.raises(InputError, match="cycle_rr_s is None"):
         clock.change_field(None)
+
+
+def test_after_lost_leads_three_intervals_are_needed():
+    """The beat that ends the silence closes no interval."""
+    clock = PhaseClock(0.8)
+    beating(clock, 20.0)
+    clock.at(20.0, usable=False)
+    said = beating(clock, 26.0, start_s=20.004)
+    assert next(k for k, tick in enumerate(said) if tick.valid) == 50 + 3 * 200

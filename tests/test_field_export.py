@@ -254,9 +254,12 @@ def test_files_that_cannot_be_written_whole_are_refused_and_leave_nothing(path, 
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))\n"
         f"sys.exit(main(['export', {str(path)!r}, '--to', {form!r}, '--out', 'new']))"
     )
+    # A place for compiled code that the user names is tried before anything else.
+    surroundings = {key: one for key, one in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     ended = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+        [sys.executable, "-c", script],
+        cwd=tmp_path, env=surroundings, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert ended.returncode == 2, ended.stderr
     assert ended.stderr.startswith("error: new: a file would be larger than `ulimit -f`")
     assert len(ended.stderr.splitlines()) == 1

@@ -194,3 +194,34 @@ def test_in_debt_a_force_across_the_way_waits_too():
     tank = EnergyTank(0.0, 5.0)
     tank.passed((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     assert tank.passed((1.0, 0.0, 0.0), (-1.0, 1.0, 0.0)) == (-1.0, 0.0, 0.0)
+
+
+def test_a_tank_holds_no_more_than_its_capacity():
+    tank = EnergyTank(19.0, 20.0)
+    tank.passed((0.0, 0.0, 0.0), (-5.0, 0.0, 0.0))
+    tank.passed((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert tank.level_mj == 20
+
+
+def test_of_a_step_that_costs_more_than_is_left_only_that_is_rendered():
+    """0.1 mJ are left, and the next step would take 0.76 along its way, and nothing across."""
+    tank = EnergyTank(0.5, 0.5)
+    tank.passed((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    found = tank.passed((0.4, 0.0, 0.0), (2.0, 1.0, 0.0))
+    assert found == pytest.approx((0.1 / 0.4, 0.95, 0.0))
+
+
+def test_a_force_that_is_no_number_ends_what_was_held():
+    tank = EnergyTank(5.0, 20.0)
+    tank.passed((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    assert tank.passed((1.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)) == (0.0, 0.0, 0.0)
+    tank.passed((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert tank.level_mj == pytest.approx(4.0)
+
+
+def test_a_point_whose_memory_is_used_again_is_remembered():
+    tank, here = EnergyTank(5.0, 20.0), [0.0, 0.0, 0.0]
+    tank.passed(here, (1.0, 0.0, 0.0))
+    here[0] = 1.0
+    tank.passed(here, (1.0, 0.0, 0.0))
+    assert tank.level_mj == pytest.approx(4.0)

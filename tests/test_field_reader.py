@@ -393,6 +393,9 @@ def test_query_says_what_the_device_has_to_follow(path, field):
     alone = {"stiffness_n_per_m": 386.0, "stiffness_measured_n_per_m": None}
     said = stiffness_words({**alone, "stiffness_limit_n_per_m": None})
     assert said == "stiffness 386 N/m by its law"
+    soft = {"stiffness_n_per_m": 321.4, "stiffness_measured_n_per_m": 400.2}
+    said = stiffness_words({**soft, "stiffness_limit_n_per_m": 400.0})
+    assert said.endswith("the device renders 400, less than measured")
 
 
 def test_a_store_with_a_fixture_that_its_device_cannot_render_is_refused(path, tmp_path):

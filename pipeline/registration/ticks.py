@@ -59,7 +59,7 @@ NEAREST_S = 0.18
 a pulse of a pacemaker or of diathermy, and tells no rate."""
 R_SD_S = 0.002
 CLOSE = 0.02
-"""Largest distance in phase from where the beats say for a phase to be valid."""
+"""Largest distance in phase from where the beats say for a phase to become valid."""
 MOST_SD = 0.05
 SLOWEST, QUICKEST = 0.5, 1.5
 """The phase is corrected by running at no less and no more than so many times its own speed."""
@@ -327,10 +327,9 @@ def _turn(c: Float, before_s: float, now_s: float) -> None:
     by_peak = R_SD_S / c[RR]
     c[SD] = math.sqrt(by_interval * by_interval + by_peak * by_peak + off * off)
     good = c[STATE] == REGULAR and c[GOOD] >= c[NEEDED] and c[SD] <= MOST_SD
-    # Once valid, a beat that corrects the phase a little more than usual does not end it.
-    c[VALID] = (
-        1.0 if good and (abs(off) <= CLOSE or (c[VALID] > 0.0 and abs(off) <= 3 * CLOSE)) else 0.0
-    )
+    # Once valid, a beat that corrects the phase more than that does not end it, as long as the
+    # phase is sure: how far it is off is a part of how unsure it is.
+    c[VALID] = 1.0 if good and (c[VALID] > 0.0 or abs(off) <= CLOSE) else 0.0
 
 
 @asked

@@ -489,7 +489,7 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
 {
     double rr_s = c->known.rr_s, there = bfc_beats_since(c, now_s, rr_s);
     double natural = there - bfc_beats_since(c, before_s, rr_s), place = there - floor(there);
-    double off, h, by_interval, by_peak, near_enough;
+    double off, h, by_interval, by_peak;
     if (c->fade == 0.0 && !c->valid) {
         c->phase = place;
     } else {
@@ -503,9 +503,8 @@ static void bfc_turn(bf_clock *c, double before_s, double now_s)
                   bfc_wrapped(bfc_place(c, now_s, rr_s - h) - bfc_place(c, now_s, rr_s + h));
     by_peak = BFC_R_SD_S / rr_s;
     c->sd = sqrt(by_interval * by_interval + by_peak * by_peak + off * off);
-    near_enough = c->valid ? 3.0 * BFC_CLOSE : BFC_CLOSE;
     c->valid = c->known.rhythm == BF_REGULAR && c->known.good >= c->known.needed &&
-               c->sd <= BFC_MOST_SD && fabs(off) <= near_enough && c->fade_per_s > 0.0 &&
+               c->sd <= BFC_MOST_SD && (c->valid || fabs(off) <= BFC_CLOSE) && c->fade_per_s > 0.0 &&
                c->latency_s > 0.0 && c->latency_s <= 1.0;
 }
 
