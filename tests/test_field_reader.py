@@ -348,6 +348,17 @@ def test_a_field_in_memory_is_what_it_was_whatever_becomes_of_its_files(path, tm
     assert kept.force_at(*points[0], PHASES[1]) == field.force_at(*points[0], PHASES[1])
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_field_that_is_copied_into_memory_has_no_hole(path, tmp_path, wrong):
+    """As `bf_lock` of the C header finds it; mapped, it is found by the question that meets it."""
+    folder = shutil.copytree(path, tmp_path / "f.zarr")
+    chunk = sorted(folder.glob("spline/*/c/*/0/0/0"))[-1]
+    np.memmap(chunk, "<f4", "r+")[-1] = wrong
+    ForceField.open(folder)
+    with pytest.raises(InputError, match=r"f\.zarr: is damaged: a value in it is not finite"):
+        ForceField.open(folder, in_memory=True)
+
+
 def test_numbers_of_any_type_are_answered_without_compiling_anew(field):
     """A compilation takes seconds, in which a hand would be held by a force of long ago."""
     expected = field.force_at(14.0, 2.0, 1.0, 0.0), field.distance_at(14.0, 2.0, 1.0, 0.0)

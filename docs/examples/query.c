@@ -1,4 +1,4 @@
-/* Ask a baked field for the force at a point, as `beatfield query` does, outside the grid too.
+/* Ask a baked field for the force at a point, as `beatfield query` does, and outside the grid, too.
  *
  *     cc -O2 -I "$(python -c 'from pipeline.field import get_include; print(get_include())')" \
  *        docs/examples/query.c -o query -lm

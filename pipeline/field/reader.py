@@ -109,7 +109,12 @@ class ForceField:
         return [map_phase(self._path / part, index, self._grid) for index in range(count)]
 
     def _kept(self, coefficients: Float32) -> Float32:
-        return readable_in_fours(coefficients.copy() if self._in_memory else coefficients)
+        if not self._in_memory:
+            return readable_in_fours(coefficients)
+        kept = coefficients.copy()
+        if not np.isfinite(kept).all():
+            raise damaged(self._path)
+        return readable_in_fours(kept)
 
     @classmethod
     def open(cls, path: Path | str, in_memory: bool = False) -> ForceField:
@@ -120,14 +125,16 @@ class ForceField:
         path
             The folder.
         in_memory
-            Copy what questions read, half of the field's size, so that none waits for a disk and
-            a file that is written over or cut later changes no force. Else files are mapped.
+            Copy the coefficients, which are what questions read, so that none waits for a disk, and
+            a file that is written over or cut later changes no force; look whether all values are
+            finite. Else files are mapped.
 
         Raises
         ------
         InputError
-            When it is no complete field, its description or size is wrong, or it was replaced
-            meanwhile. Values are not compared; ``beatfield verify`` checks every byte.
+            When it is no complete field, its description or size is wrong, it was replaced
+            meanwhile, or a value that was copied is not finite. Values are not compared with the
+            manifest; ``beatfield verify`` checks every byte.
         """
         path = Path(path).resolve()
         manifest = require_manifest(path)
