@@ -604,3 +604,22 @@ def test_what_is_text_beside_images_is_no_damaged_image(tmp_path: Path) -> None:
     scanners.write_text("1.0 2.0\n")
     with pytest.raises(InputError, match=r"0001\.dcm: is not DICOM, or damaged"):
         told_from_notes([image, scanners])
+
+
+def test_phases_are_the_mean_of_the_slices_own() -> None:
+    """Of beats of 0.8 and 1 s, one slice a hundredth of a beat early and one as late."""
+    triggers = np.array([[8.0, 168, 328, 488, 648], [30.0, 230, 430, 630, 830]])
+    found = common_phases(triggers, np.array([800.0, 1000.0]), "here")
+    np.testing.assert_allclose(found, [0.02, 0.22, 0.42, 0.62, 0.82])
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "words"),
+    [([0, 200, 200, 600], "must rise"), ([0, 200, 400, 800], "do not fit in an RR interval")],
+)
+def test_two_phases_of_one_moment_or_at_the_next_r_peak_are_refused(
+    times_ms: list[int], words: str
+) -> None:
+    triggers = np.array([times_ms] * 3, float)
+    with pytest.raises(InputError, match=words):
+        common_phases(triggers, np.full(3, 800.0), "here")

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import InputError
-from pipeline.geometry import transform_points
+from pipeline.geometry import corners_apart_mm, transform_points
 from pipeline.imaging.nifti import read_image, read_nifti_cine, read_nifti_views, write_image
 from pipeline.imaging.nifti_doubts import doubts_of_place
 
@@ -427,3 +427,33 @@ def test_a_matrix_of_other_sizes_than_the_list_is_told(tmp_path: Path) -> None:
     image.header["pixdim"][3] = 10
     [told] = doubts_of_place(image)
     assert "matrix has voxels of 8 x 8 x 6 and its pixdim of 8 x 8 x 10" in told
+
+
+def test_a_step_of_one_without_a_unit_is_no_second_of_two_phases_either(tmp_path: Path) -> None:
+    """End-diastole and end-systole alone, saved by a program that knows no times."""
+    image = nibabel.Nifti1Image(np.ones((8, 6, 4, 2), np.int16), np.diag([1.5, 1.5, 8, 1]))
+    image.header.set_xyzt_units("mm", "unknown")
+    nibabel.save(image, tmp_path / "cine.nii")
+    with pytest.raises(InputError, match="a time step of 1 without a unit in its header"):
+        read_nifti_cine(tmp_path / "cine.nii", None)
+
+
+@pytest.mark.parametrize(("slices", "phases"), [(2, 5), (4, 1)])
+def test_too_few_slices_or_phases_are_named(tmp_path: Path, slices: int, phases: int) -> None:
+    pixels = np.ones((8, 6, slices, phases), np.int16)
+    nibabel.save(nibabel.Nifti1Image(pixels, np.diag([1.5, 1.5, 8, 1])), tmp_path / "cine.nii")
+    with pytest.raises(InputError, match=rf"{slices} slices of {phases} phases; at least 3"):
+        read_nifti_cine(tmp_path / "cine.nii", None, 800)
+
+
+def test_placements_are_as_far_apart_as_their_farthest_corners() -> None:
+    """Slices of 8 and of 10 mm from one first slice on: eight steps later 16 mm."""
+    one, other = np.diag([1.5, 1.5, 8, 1]), np.diag([1.5, 1.5, 10, 1])
+    assert corners_apart_mm(one, other, (5, 6, 9)) == pytest.approx(16)
+
+
+def test_the_time_from_phase_to_phase_is_written(tmp_path: Path) -> None:
+    write_image(tmp_path / "beat.nii.gz", np.zeros((5, 4, 6, 8), np.uint8), np.eye(4), 0.16)
+    header: Any = nibabel.load(tmp_path / "beat.nii.gz").header
+    assert header.get_zooms()[3] == pytest.approx(0.16)
+    assert header.get_xyzt_units() == ("mm", "sec")

@@ -404,3 +404,8 @@ def test_vertices_that_lie_where_others_do_are_told():
     apart = Surface(corners_mm, np.arange(len(corners_mm)).reshape(-1, 3))
     with pytest.raises(InputError, match=r"is not closed, 36 edges .*; merge the 28 vertices"):
         require_closed(apart, "my.stl")
+
+
+def test_a_grid_of_one_layer_is_refused():
+    with pytest.raises(InputError, match="2 nodes or more"):
+        Grid((1, 4, 4), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))

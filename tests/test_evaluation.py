@@ -24,8 +24,14 @@ from pipeline.evaluation.metrics import (
 )
 from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
-from pipeline.products import FrameRow, write_frames
-from pipeline.stages.evaluate import _frame_phase_errors, _read_truth
+from pipeline.products import FrameRow, write_frames, write_surfaces, write_table
+from pipeline.stages.evaluate import (
+    _frame_phase_errors,
+    _headline,
+    _read_truth,
+    _registration,
+    _structure,
+)
 from pipeline.surface.measures import (
     distances_mm,
     ejection_fraction,
@@ -292,3 +298,77 @@ def test_hausdorff_is_the_larger_of_both_ways():
         assert found.largest_mm > 87
         # 7 % of one surface lie some 90 mm off and of the other none: the mean of both ways.
         assert found.mean_mm == pytest.approx(0.5 * 0.07 * 90, rel=0.2)
+
+
+def test_registration_and_phases_of_frames_are_held_against_truth(tmp_path):
+    """A quarter turn about z and 10 mm along x too much, of three points known by hand.
+
+    (10, 0, 0) is taken to (10, 10, 0), (0, 20, 0) to (-10, 0, 0) and (0, 0, 30) to (10, 0, 30):
+    missed by 10, by the root of 500 and by 10 mm. The start was 7 mm off everywhere.
+    """
+    true, off, beside = np.eye(4), np.eye(4), np.eye(4)
+    true[:3, 3] = 5, -6, 7
+    off[:2] = [[0, -1, 0, 10], [1, 0, 0, 0]]
+    beside[2, 3] = 7
+    for name in ("register", "surfaces"):
+        (tmp_path / name).mkdir()
+    table = {"mr_from_tracker": (off @ true).tolist()}
+    write_table(tmp_path / "register" / "mr_from_tracker.json", table)
+    corners = np.array([[10.0, 0, 0], [0, 20, 0], [0, 0, 30]])
+    heart = MovingSurface(corners[None], np.array([[0, 1, 2]]), np.zeros(1))
+    write_surfaces(tmp_path / "surfaces", {"heart": heart})
+    # Frame k is k hundredths of a beat early; truth knows one frame more, and lists the last first.
+    times_s, true_phases = 3 + 0.04 * np.arange(22), np.linspace(0.95, 1.15, 22) % 1
+    rows = [
+        FrameRow("fan", k, times_s[k] + 0.004, (true_phases[k] - k / 100) % 1, 0.1, valid=True)
+        for k in range(21)
+    ]
+    write_frames(tmp_path / "register" / "frames.csv", rows)
+    fan = {"times_s": times_s[::-1].tolist(), "mechanical_phases": true_phases[::-1].tolist()}
+    known = {"mr_from_tracker": true.tolist(), "us_frames": {"fan": fan}}
+    us = SimpleNamespace(start=lambda: beside @ true)
+    job = SimpleNamespace(products=tmp_path, study=SimpleNamespace(folder=tmp_path, us=us))
+    found = _registration(job, tmp_path, known)
+    mean_mm, largest_mm = round((20 + 500**0.5) / 3, 3), round(500**0.5, 3)
+    assert found == {
+        "target_registration_error_mm": {
+            "start_mean": 7.0, "mean": mean_mm, "largest": largest_mm
+        },
+        "frame_phase_error": {
+            "mean": 0.1, "percentile_95": 0.19, "largest": 0.2
+        },
+    }  # fmt: skip
+    headline = _headline({"structures": {}} | found)
+    assert headline["target_registration_error_mm"] == mean_mm
+    assert headline["largest_frame_phase_error"] == 0.2
+
+
+def test_the_headline_is_the_worst_phase_and_every_structure_sound():
+    good = {"mean_surface_distance_mm": [0.4, 1.2, 0.7]}
+    good |= dict.fromkeys(("closed", "one_component", "outward"), True)
+    assert _headline({"structures": {"aorta": good}}) == {
+        "worst_mean_surface_distance_mm": {"aorta": 1.2}, "all_closed": True,
+    }  # fmt: skip
+    for lacking in ("closed", "one_component", "outward"):
+        bad = good | {lacking: False}
+        assert not _headline({"structures": {"aorta": bad, "heart": good}})["all_closed"]
+
+
+def test_each_distance_is_told_by_its_own_name():
+    """A piece of 3 % of the truth's area that the surface lacks, some 90 mm away."""
+    near, far = sphere(10.0), sphere(1.76, (100, 0, 0))
+    both = Surface(
+        np.concatenate([near.vertices_mm, far.vertices_mm]),
+        np.concatenate([near.triangles, far.triangles + len(near.vertices_mm)]),
+    )
+    found = _structure(MovingSurface(near.vertices_mm[None], near.triangles, np.zeros(1)), [both])
+    assert found["mean_surface_distance_mm"] == [pytest.approx(0.5 * 0.03 * 90, rel=0.1)]
+    assert found["hausdorff_95_mm"][0] < 0.1
+    assert found["largest_distance_mm"][0] > 87
+
+
+def test_a_surface_that_one_phase_turns_inside_out_is_not_outward():
+    cube = box(10.0)
+    path = np.stack([cube.vertices_mm, cube.vertices_mm * (-1, 1, 1)])
+    found = _structure(MovingSurface(path, cube.triangles, np.array([0, 0.5])), [cube, cube])
+    assert (found["closed"], found["outward"]) == (True, False)

@@ -24,6 +24,7 @@ from pipeline.imaging.nifti import write_image
 from pipeline.job import Job
 from pipeline.products import read_labels, write_labels, write_surfaces, write_table
 from pipeline.stages import evaluate
+from pipeline.stages.evaluate import _labels
 
 RADIUS_MM = 30.0
 PHASES = np.array([0.0, 0.5])
@@ -220,6 +221,8 @@ def test_the_stage_measures_what_was_put_there(job: Job) -> None:
         assert motion["normal_mean"] == motion["normal"][1] < 10 * EDGE**2
         assert motion["tangential_mean"] < 10 * EDGE
     assert metrics["structures"]["lv_endocardium"]["dice"] == [1.0, round(2 * 24 / 56, 4)]
+    # Its muscle, that is, which these labels do not show.
+    assert metrics["structures"]["epicardium"]["dice"] == []
     assert metrics["slice_dice"] == [[1.0, 1.0, None], [1.0, round(2 * 8 / 24, 4), None]]
     for side in ("lv", "rv"):
         fraction = metrics[f"{side}_ejection_fraction"]
@@ -314,3 +317,39 @@ def test_what_is_written_opens_elsewhere_however_its_axes_are_rounded(tmp_path: 
     image = SimpleITK.ReadImage(str(tmp_path / "image.nii.gz"))
     far = image.TransformContinuousIndexToPhysicalPoint((5.0, 4.0, 3.0))
     np.testing.assert_allclose(far, affine[:3, :3] @ [5, 4, 3], atol=0.02)
+
+
+def test_a_structure_that_truth_shows_in_one_phase_alone_counts(job: Job) -> None:
+    """As an atrium that comes into the stack while the ventricles are short."""
+    assert job.study.truth is not None
+    labels, mr_from_index = read_labels(job.study.truth, "labels")
+    labels[1, 2] = LABELS["left_atrium"]
+    write_labels(job.study.truth, "labels", labels, mr_from_index)
+    evaluate.run(job)
+    metrics = json.loads((job.folder / "metrics.json").read_text())
+    assert "left_atrium" not in metrics["labels_without_truth"]
+    assert metrics["slice_dice"][1][2] == 0.0
+
+
+@pytest.mark.parametrize(("off_mm", "refused"), [(0.4, False), (0.6, True)])
+def test_truth_that_lies_more_than_rounding_aside_is_refused(
+    job: Job, off_mm: float, refused: bool
+) -> None:
+    found = read_labels(job.products / "segment", "labels")
+    known = found[0], found[1] + np.outer([0, 1, 0, 0], [0, 0, 0, off_mm])
+    assert job.study.truth is not None
+    write_labels(job.study.truth, "labels", *known)
+    if not refused:
+        _labels(job, job.study.truth)
+        return
+    with pytest.raises(InputError, match=r"up to 0\.6 mm beside those found"):
+        _labels(job, job.study.truth)
+
+
+def test_errors_are_across_where_the_wall_has_turned_to() -> None:
+    """A sphere turned by a quarter and found 1 mm larger: across it all over, along it nowhere."""
+    turn = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    larger = 1 + 1 / RADIUS_MM
+    error = motion_error(found(lambda p: larger * p @ turn.T), truth(lambda p: p @ turn.T))
+    assert error.normal_mm[1] == pytest.approx(1, abs=2 * EDGE)
+    assert error.tangential_mm[1] < 2 * EDGE

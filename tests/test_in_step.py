@@ -143,3 +143,11 @@ def test_nothing_is_told_of_a_slice_at_the_valves_that_loses_its_muscle():
     last[last == LABELS["lv_myocardium"]] = 0
     labels[5:, 3, :, :34][labels[5:, 3, :, :34] == LABELS["lv_myocardium"]] = 0
     assert out_of_step(labels, np.arange(PHASES) / PHASES, PIXEL_MM) == {}
+
+
+def test_nothing_is_told_of_a_slice_that_the_valves_leave_in_systole():
+    """Its cavity all but goes while the plane of the valves is below it: no sign of another beat,
+    whatever it shows meanwhile."""
+    usual = areas()
+    passed = np.where(np.arange(PHASES) % 2, 0.15, 0.9)
+    assert told(usual, usual, usual, passed) == {}

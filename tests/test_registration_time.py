@@ -366,3 +366,26 @@ def test_one_beat_that_was_not_found_leaves_its_interval_without_phases():
     r_times_s = np.delete(0.3 + 0.8 * np.arange(20), 10)
     known = in_known_beats(np.array([7.4, 7.6, 8.3, 9.0, 9.2]), r_times_s)
     assert known.tolist() == [True, False, False, False, True]
+
+
+def test_phases_of_a_slow_beat_are_those_of_the_nominal_one():
+    """Systole lasts 547.5 - 2.05 HR ms (Weissler 1968) less 40 ms from Q to R, so 405 ms of a beat
+    of 1.2 s and 353.75 ms of one of 0.8 s; atria contract 120 ms before the next R in both."""
+    r_times_s = 0.5 + 1.2 * np.arange(5)
+    times_s = r_times_s[2] + np.array([0.0, 0.405, 1.08])
+    found = phases_at(times_s, r_times_s, 0.8)
+    np.testing.assert_allclose(found, [0, 0.35375 / 0.8, 0.68 / 0.8], atol=1e-3)
+
+
+@pytest.mark.parametrize(("longer", "known"), [(1.6, True), (1.9, False)])
+def test_an_interval_nearly_twice_as_long_holds_a_beat_that_was_not_found(longer, known):
+    """The heart was a little faster then; half as long again is a pause."""
+    rr_s = np.full(20, 0.8)
+    rr_s[10] *= longer
+    r_times_s = np.cumsum(np.concatenate([[0.5], rr_s]))
+    assert in_known_beats(np.array([r_times_s[10] + 0.4]), r_times_s).tolist() == [known]
+
+
+def test_a_sampling_rate_told_twice_as_high_is_doubted():
+    (said,) = doubts_of_rate(0.4 * np.arange(20), 0.8)
+    assert "150 times a minute" in said

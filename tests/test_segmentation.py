@@ -296,10 +296,15 @@ def sheared_cine():
     return Cine(np.zeros((2, 4, 50, 70), np.float32), mr_from_index, np.array([0, 0.5]), 1.0)
 
 
-def test_view_places_every_slice_where_the_file_says():
+@pytest.mark.parametrize("base_first", [False, True])
+def test_view_places_every_slice_where_the_file_says(base_first):
     """A pixel of the view and the cine pixel it maps to are one point in the patient."""
     cine = sheared_cine()
+    if base_first:
+        turned = cine.mr_from_index @ np.diag([1.0, 1, -1, 1])
+        cine = replace(cine, mr_from_index=turned)
     seen = view.view_of(cine)
+    assert seen.order == ((3, 2, 1, 0) if base_first else (0, 1, 2, 3))
     for number, z in enumerate(seen.order):
         for column, row in [(0, 0), (30, 12), (5, 40)]:
             x, y = seen.image_from_view(number) @ (column, row, 1.0)
@@ -408,3 +413,25 @@ def test_an_auricle_is_joined_along_a_likely_neck_and_no_other(neck, joined):
     assert found[2, 20, 40] == joined
     assert found[2, 20, 27] == joined
     assert label(found, np.ones((3, 3, 3)))[1] == 1
+
+
+@pytest.mark.parametrize(("off_deg", "first"), [(25, (1, 0, 0)), (10, (0, 1, 0))])
+def test_columns_run_to_the_left_unless_slices_are_almost_sagittal(off_deg, first):
+    """There, where left is the way through the slices, they run to the back."""
+    cosine, sine = np.cos(np.radians(off_deg)), np.sin(np.radians(off_deg))
+    axes = view.canonical_axes(np.array([-cosine, 0.0, sine]))
+    # The shadow of left is as long as the sine of what lies between; back lies in the plane.
+    assert axes[0] @ first == pytest.approx(sine if first[0] else 1)
+
+
+def test_fine_pixels_are_averaged_along_the_axis_on_which_they_are_fine():
+    """Stripes of 0.5 mm vanish in pixels of 1.5 mm; stripes of 1.5 mm beside them stay."""
+    cine = Cine(
+        np.zeros((2, 3, 40, 120), np.float32), np.diag([0.5, 1.5, 8, 1]), np.array([0, 0.5]), 1.0
+    )
+    seen = view.view_of(cine)
+    fine, coarse = np.zeros((2, 40, 120), np.float32)
+    fine[:, ::2], coarse[::2] = 1, 1
+    middle = np.s_[8:-8, 8:-8]
+    assert np.ptp(seen.sample(fine, 1)[middle]) < 0.1
+    assert np.ptp(seen.sample(coarse, 1)[middle]) > 0.9

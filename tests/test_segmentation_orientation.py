@@ -353,3 +353,42 @@ def test_one_look_of_several_goes_without_the_slice_towards_the_apex(
         np.testing.assert_array_equal(look[:-1, 2], look[1:, 1])
         first = 4 if own else 1
         np.testing.assert_array_equal(look[first:, 0], look[first - 1 : -1, 1])
+
+
+def test_a_cropped_view_shows_that_part_of_the_whole():
+    cine = smooth_cine()
+    whole = view_of(cine)
+    image = np.random.default_rng(2).normal(size=cine.intensity.shape[2:]).astype(np.float32)
+    part = whole.cropped((3, 11), (20, 30)).sample(image, 1)
+    np.testing.assert_allclose(part, whole.sample(image, 1)[3:23, 11:41], atol=1e-3)
+
+
+@pytest.mark.parametrize(("turn_deg", "believed"), [(66, True), (76, False)])
+def test_a_right_ventricle_seventy_degrees_off_speaks_against_the_file(turn_deg, believed):
+    look = looking_at(Orientation(turn_deg))
+    assert find_orientation(look).is_the_files == believed
+
+
+@pytest.mark.parametrize(("share", "mirrored"), [(0.83, True), (0.87, False)])
+def test_a_file_is_mirrored_by_a_seventh_less_doubt(share, mirrored):
+    labels = drawn_heart(np.eye(3))
+    found = find_orientation(lambda tried: (labels, 1000.0 * (share if tried.mirrored else 1)))
+    assert found.mirrored == mirrored
+
+
+@pytest.mark.parametrize(("share", "believed"), [(1.08, False), (1.13, True)])
+def test_a_file_is_believed_where_any_other_way_is_more_doubtful(share, believed):
+    look = looking_at(Orientation(180))
+
+    def doubtful(tried):
+        return look(tried)[0], 1000.0 * (1 if tried.is_the_files else share)
+
+    assert find_orientation(doubtful).is_the_files == believed
+
+
+def test_atria_lie_at_the_base_whatever_the_ventricles_taper():
+    labels = np.zeros((8, 40, 40), np.uint8)
+    labels[:6, 10:30, 10:20] = LABELS["lv_cavity"]
+    labels[5:, 5:35, 10:30] = LABELS["left_atrium"]
+    assert lie_of(labels).rise > 0.25
+    assert lie_of(labels[::-1]).rise < -0.25

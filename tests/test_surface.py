@@ -14,7 +14,7 @@ from surface_shapes import SPACING_MM, MovingBody, ellipsoid, voxel_centres, vox
 
 from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
-from pipeline.geometry import Float, Label, MovingSurface, transform_points
+from pipeline.geometry import Float, Label, MovingSurface, nearest_phase, transform_points
 from pipeline.imaging.labels import LABELS
 from pipeline.surface.bodies import Body, _without_tunnels, joined
 from pipeline.surface.extraction import STRUCTURES, extract
@@ -353,3 +353,8 @@ def test_input_that_does_not_fit_is_refused(heart, frame, phases, words):
 def test_unknown_or_senseless_settings_fail(bad):
     with pytest.raises(ValidationError):
         SurfaceSettings.model_validate(bad)
+
+
+def test_the_nearest_phase_is_sought_around_the_cycle():
+    assert nearest_phase(np.array([0.02, 0.5, 0.9]), 0.98) == 0
+    assert nearest_phase(np.array([0.02, 0.5, 0.9]), 0.95) == 2

@@ -279,3 +279,38 @@ def test_a_thin_scar_does_not_turn_the_axis():
         axis = base_direction(shape, outer)
         assert axis is not None
         assert np.degrees(np.arccos(min(axis @ POLE, 1))) < 3
+
+
+@pytest.mark.parametrize(
+    ("direction", "name"),
+    [
+        (ANTERIOR, "apical anterior"), (SEPTUM, "apical septal"),
+        (-ANTERIOR, "apical inferior"), (-SEPTUM, "apical lateral"),
+    ],
+)  # fmt: skip
+def test_apical_quarters_lie_about_their_walls(direction, name):
+    inner, right = (SURFACES[one].at(0) for one in ("lv_endocardium", "rv_endocardium"))
+    names = segment_names(inner, ~on_lid(inner, POLE), POLE, right)
+    middle = inner.vertices_mm[names == name].mean(axis=0)
+    middle -= (middle @ POLE) * POLE
+    # A quarter's vertices are some fifty, of 3 degrees each.
+    assert middle @ direction > np.cos(np.radians(5)) * np.linalg.norm(middle)
+
+
+def test_the_mean_thickness_does_not_depend_on_where_triangles_are_small():
+    """A ball in an ellipsoid, thick at the poles, where a globe's meridians crowd."""
+    import pyvista
+
+    globe = pyvista.Sphere(radius=25, theta_resolution=60, phi_resolution=60)
+    even = pyvista.Icosphere(radius=25, nsub=4)
+    outer = pyvista.Icosphere(radius=1, nsub=5)
+    shell, found = np.array(outer.points, float) * (33, 33, 41), []
+    for ball in (globe, even):
+        inner = np.array(ball.points, float)
+        pair = [
+            MovingSurface(points[None], np.array(mesh.regular_faces), PHASES[:1])
+            for points, mesh in ((inner, ball), (shell, outer))
+        ]
+        table = measures({"lv_endocardium": pair[0], "epicardium": pair[1]})
+        found.append(table["lv_wall_thickness_mm"]["mean"][0])
+    assert found[0] == pytest.approx(found[1], abs=0.05)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from sweep_files import FRAMES, PIXELS, calibration, good_fields, rigid, text, write
 
 from pipeline.errors import InputError
+from pipeline.geometry import require_rigid
 from pipeline.imaging.ultrasound import read_sweep, read_sweeps, remarks_on
 from pipeline.products import write_slicer_transform
 from pipeline.run import STAGES, _described
@@ -329,3 +330,17 @@ def test_a_size_of_pixels_beside_the_calibration_is_told_and_instead_of_it_refus
         read_sweep(tmp_path / "s.mha")
     given = calibration() @ np.eye(4)
     assert len(read_sweep(tmp_path / "s.mha", probe_from_image=given).remarks) == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (np.diag([1.0, 1, -1, 1]), "it mirrors"),
+        (np.diag([1.0, 1, 1.002, 1]), "is not a rotation and a shift"),
+        (np.eye(4) + 1e-4 * np.outer([0, 0, 0, 1], [1, 0, 0, 0]), "is not a rotation and a shift"),
+    ],
+)
+def test_what_mirrors_stretches_or_projects_is_no_rigid_motion(wrong, words):
+    require_rigid(np.eye(4), "here")
+    with pytest.raises(InputError, match=words):
+        require_rigid(wrong, "here")
