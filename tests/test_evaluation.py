@@ -343,6 +343,24 @@ def test_registration_and_phases_of_frames_are_held_against_truth(tmp_path):
     assert headline["largest_frame_phase_error"] == 0.2
 
 
+def test_phases_of_truth_are_brought_to_the_beat_of_the_mr(tmp_path):
+    """Systole lasts 547.5 - 2.05 HR ms (Weissler 1968) less 40 ms from Q to R, so 405 ms of the
+    MR's beat of 1.2 s and 353.75 ms of truth's of 0.8 s; atria contract 120 ms before R."""
+    for name in ("ingest", "register"):
+        (tmp_path / name).mkdir()
+    write_table(tmp_path / "ingest" / "phases.json", {"rr_s": 1.2})
+    found, true = [0.0, 0.405 / 1.2, 1.08 / 1.2], [0.0, 0.35375 / 0.8, 0.68 / 0.8]
+    rows = [FrameRow("fan", k, float(k), phase, 0.1, valid=True) for k, phase in enumerate(found)]
+    write_frames(tmp_path / "register" / "frames.csv", rows)
+    known = {"us_frames": {"fan": {"times_s": [0, 1, 2], "mechanical_phases": true}}}
+    job = SimpleNamespace(products=tmp_path, study=SimpleNamespace(folder=tmp_path))
+    apart = np.array(found) - true
+    assert np.abs(apart).max() > 0.05
+    np.testing.assert_allclose(_frame_phase_errors(job, known), apart, atol=1e-6)
+    known["settings"] = {"heart_rate_bpm": 75.0}
+    np.testing.assert_allclose(_frame_phase_errors(job, known), 0, atol=1e-6)
+
+
 def test_the_headline_is_the_worst_phase_and_every_structure_sound():
     good = {"mean_surface_distance_mm": [0.4, 1.2, 0.7]}
     good |= dict.fromkeys(("closed", "one_component", "outward"), True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from pipeline.imaging.nifti_doubts import SAME_PLACE_MM
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
 from pipeline.products import read_frames, read_labels, read_surfaces, read_table, write_table
+from pipeline.registration.clock import to_cycle
 from pipeline.surface.measures import ejection_fraction, mean_lv_mass_g, volumes_ml
 
 LABEL_OF_SURFACE = {
@@ -219,11 +221,8 @@ def _registration(job: Job, truth: Path, known: dict[str, Any]) -> dict[str, Any
 
 
 def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
-    """Cyclic phase error of every frame, matched to truth by its time stamp.
-
-    Truth is where in the cycle of the MR's mean beat the heart was, as the frames' phases are.
-    """
-    errors = []
+    """Cyclic phase error of every frame, matched to truth by its time stamp."""
+    axis, errors = _axis(job, known), []
     for row in read_frames(job.products / "register" / "frames.csv"):
         sweep = known["us_frames"].get(row.sweep)
         if sweep is None:
@@ -232,9 +231,19 @@ def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
                 f"{', '.join(known['us_frames'])}; give the files their names, or take truth/ out"
             )
         nearest = int(np.abs(np.array(sweep["times_s"]) - row.time_s).argmin())
-        true = sweep["mechanical_phases"][nearest]
-        errors.append(phase_error(np.array(row.phase), np.array(true)))
+        true = axis(sweep["mechanical_phases"][nearest])
+        errors.append(phase_error(np.array(row.phase), true))
     return np.array(errors)
+
+
+def _axis(job: Job, known: dict[str, Any]) -> Callable[[float], Any]:
+    """How a phase of truth's beat, which lasts what the heart rate asked for says, is brought to
+    the MR's mean beat, whose phases the frames have: as it is where one of the two is not known."""
+    rate_bpm = known.get("settings", {}).get("heart_rate_bpm")
+    cycle_rr_s = read_table(job.products / "ingest" / "phases.json")["rr_s"] if rate_bpm else None
+    if cycle_rr_s is None:
+        return np.asarray
+    return lambda phase: to_cycle(phase, 60 / rate_bpm, cycle_rr_s)
 
 
 def _headline(metrics: dict[str, Any]) -> dict[str, Any]:
