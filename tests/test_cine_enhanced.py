@@ -135,3 +135,28 @@ def test_the_slices_of_a_volume_need_no_heartbeat_each(tmp_path: Path) -> None:
     assert ingested(tmp_path / "volume", thick_mm=1.5, ecg_s=20)["slices"] == 40
     with pytest.raises(InputError, match="shorter than the cine"):
         ingested(tmp_path / "stack", thick_mm=8.0, ecg_s=20)
+
+
+def test_what_a_frame_says_itself_goes_before_what_is_said_of_all(tmp_path: Path) -> None:
+    data = enhanced_object(ALL_FRAMES)
+    data.SharedFunctionalGroupsSequence[0].update(
+        {
+            "PlanePositionSequence": item(ImagePositionPatient=[0.0, 0.0, 0.0]),
+            "PixelValueTransformationSequence": item(
+                RescaleSlope="3", RescaleIntercept="5", RescaleType="US"
+            ),
+        }
+    )
+    for own in data.PerFrameFunctionalGroupsSequence:
+        own.PixelValueTransformationSequence = item(
+            RescaleSlope="1", RescaleIntercept="0", RescaleType="US"
+        )
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+def test_the_interval_of_a_frame_goes_before_the_rounded_heart_rate(tmp_path: Path) -> None:
+    data = enhanced_object(ALL_FRAMES)
+    data.HeartRate = "80"
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path))

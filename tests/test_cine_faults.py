@@ -623,3 +623,24 @@ def test_two_phases_of_one_moment_or_at_the_next_r_peak_are_refused(
     triggers = np.array([times_ms] * 3, float)
     with pytest.raises(InputError, match=words):
         common_phases(triggers, np.full(3, 800.0), "here")
+
+
+@pytest.mark.parametrize(("off", "fits"), [(0.060, True), (0.066, False)])
+def test_of_few_phases_a_slice_may_be_half_a_step_off(off: float, fits: bool) -> None:
+    """A sixteenth of a cycle, of eight; the mean of a hundred slices hardly follows the one."""
+    times_ms = np.tile(800 * (0.05 + 0.1 * np.arange(8)), (100, 1))
+    times_ms[3] += 800 * off
+    if fits:
+        common_phases(times_ms, np.full(100, 800.0), "cine")
+    else:
+        with pytest.raises(InputError, match=r"slice 3 lies 0\.065 of a cycle off"):
+            common_phases(times_ms, np.full(100, 800.0), "cine")
+
+
+@pytest.mark.parametrize(("off", "told"), [(0.019, False), (0.022, True)])
+def test_a_slice_more_than_half_a_step_off_is_told(off: float, told: bool) -> None:
+    """A fiftieth of a cycle, of 25 phases."""
+    times_ms = np.tile(800 * (0.02 + 0.03 * np.arange(25)), (100, 1))
+    times_ms[3] += 800 * off
+    doubts = doubts_of_phases(times_ms, np.full(100, 800.0), range(100))
+    assert [doubt[:19] for doubt in doubts] == ["slice 3 lies 0.022 "] * told

@@ -15,6 +15,7 @@ from cine_files import (
     ORIGIN_MM,
     PHASES,
     ROWS,
+    RR_MS,
     SLICES,
     STEP_MM,
     Change,
@@ -186,3 +187,49 @@ def test_images_two_degrees_apart_are_not_of_one_stack() -> None:
     for degrees, same in ((0.9, True), (1.1, False)):
         assert have_same_axes(turned(0), turned(degrees)) == same
         assert are_parallel(turned(0), turned(degrees)) == same
+
+
+def test_who_gives_the_rr_interval_is_not_asked_for_it_again(tmp_path: Path) -> None:
+    """60,000 / 40 is far from the `RR_MS` that the images tell, too."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.HeartRate = "40"
+        return True
+
+    write_dicom(tmp_path, change)
+    for given_ms, asked in ((None, True), (RR_MS, False)):
+        remarks = read_dicom_cine(tmp_path, given_ms).remarks
+        assert any("HeartRate 1500 ms" in one for one in remarks) == asked
+
+
+def test_directions_written_with_few_decimals_shrink_no_pixel(tmp_path: Path) -> None:
+    """0.707 for the root of a half: a vector 0.15 thousandths too short."""
+    axes = [0.707, 0.707, 0.0, 0.0, 0.0, -1.0]
+    normal = np.array([-1.0, 1.0, 0.0]) / np.sqrt(2)
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.ImageOrientationPatient = axes
+        data.ImagePositionPatient = (number * STEP_MM * normal).tolist()
+        return True
+
+    write_dicom(tmp_path, change)
+    found = read_dicom_cine(tmp_path).cine
+    np.testing.assert_allclose(found.spacing_mm, (1.25, 1.5, STEP_MM), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("skew", "fits"), [(0.002, True), (0.02, False)])
+def test_rows_and_columns_that_are_not_at_right_angles_are_refused(
+    tmp_path: Path, skew: float, fits: bool
+) -> None:
+    """A degree is more than rounding, and no scanner's."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.ImageOrientationPatient = [0.8, 0.6, 0.0, 0.8 * skew, 0.6 * skew, -1.0]
+        return True
+
+    write_dicom(tmp_path, change)
+    if fits:
+        read_dicom_cine(tmp_path)
+    else:
+        with pytest.raises(InputError, match="ImageOrientationPatient"):
+            read_dicom_cine(tmp_path)

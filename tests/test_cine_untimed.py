@@ -15,6 +15,7 @@ from cine_files import (
     dicom_frame,
     enhanced_object,
     in_series,
+    item,
     pixel_value,
     read_dicom_cine,
     write_dicom,
@@ -176,3 +177,14 @@ def test_what_lies_across_is_spread_where_it_has_as_many_images(
     assert len(found) == views
     assert ('series 9 "real time"' in stack.remarks[0]) == bool(views)
     assert (stack.left_out[-1].endswith("it has no trigger times")) == (not views)
+
+
+def test_frames_that_tell_their_order_in_time_need_not_be_stored_in_it(tmp_path: Path) -> None:
+    """DICOM PS3.3 C.7.6.16.2.2: TemporalPositionIndex rises with time, from 1."""
+    order = ALL_FRAMES[::-1]
+    data = enhanced_object(order)
+    for frame, (_, phase) in zip(data.PerFrameFunctionalGroupsSequence, order, strict=True):
+        del frame.CardiacSynchronizationSequence
+        frame.FrameContentSequence = item(TemporalPositionIndex=phase + 1)
+    data.save_as(tmp_path / "all.dcm")
+    assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))

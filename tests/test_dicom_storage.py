@@ -12,6 +12,7 @@ from cine_files import assert_is_the_stack, pixel_value, read_dicom_cine, write_
 from pydicom import dcmread, dcmwrite
 from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset, FileDataset
+from pydicom.uid import ExplicitVRBigEndian
 
 from pipeline.errors import InputError
 
@@ -190,6 +191,44 @@ def test_overlays_in_the_upper_bits_are_no_values(tmp_path: Path) -> None:
         data.PixelData = stored.tobytes()
         data.add_new((0x6000, 0x0102), "US", 12)
         return True
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path))
+
+
+@pytest.mark.parametrize(("signed", "told"), [(True, 63536), (False, -2000)])
+def test_padding_told_with_the_other_sign_is_padding(
+    tmp_path: Path, signed: bool, told: int
+) -> None:
+    """-2000 and 63536 are one word of 16 bits, which programs write as either."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        stored = pixel_value(phase, number).astype(np.int16)
+        stored[0, 1:3] = -2000
+        data.PixelRepresentation = int(signed)
+        data.add(DataElement(0x00280120, "US" if told > 0 else "SS", told))
+        data.PixelData = stored.tobytes()
+        return True
+
+    write_dicom(tmp_path, change)
+    found = read_dicom_cine(tmp_path).cine.intensity[2, 1]
+    expected = pixel_value(2, 1)
+    # The first pixel is the darkest one.
+    expected[0, 1:3] = expected[0, 0]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_values_of_twelve_bits_may_be_stored_big_end_first(tmp_path: Path) -> None:
+    """Read in the other order, nearly all of them would lie beyond their bits."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        turned = Dataset({element.tag: element for element in data})
+        turned.file_meta = data.file_meta
+        turned.file_meta.TransferSyntaxUID = ExplicitVRBigEndian
+        turned.BitsStored, turned.HighBit = 12, 11
+        turned.PixelData = pixel_value(phase, number).astype(">u2").tobytes()
+        turned.save_as(tmp_path / f"{number}_{phase}.dcm", enforce_file_format=True)
+        return False
 
     write_dicom(tmp_path, change)
     assert_is_the_stack(read_dicom_cine(tmp_path))

@@ -611,3 +611,10 @@ def test_a_dicom_waveform_of_the_other_byte_order_that_ends_within_a_sample_is_r
         dataset.save_as(path)
     with pytest.raises(InputError, match="the waveform cannot be decoded"):
         read_ecg(path)
+
+
+def test_leads_that_are_constant_where_they_are_no_gap_are_no_ecg(tmp_path):
+    steps = np.full(STEPS_UV.shape, 250.0)
+    steps[3:9] = np.nan
+    with pytest.raises(InputError, match=r"lead II: 6 of \d+ samples are not a number"):
+        read_ecg(write_csv(tmp_path / "ecg.csv", steps), gaps=True)

@@ -130,6 +130,7 @@ def test_the_falcon_has_no_known_stiffness_limit():
     [
         {"delta_mm": 1e-170, "device": "falcon"},
         {"delta_mm": 0.01, "device": "falcon"},
+        {"delta_mm": 0.09, "device": "falcon"},
         {"delta_mm": 1e308},
         {"delta_mm": None, "gamma_mm": 5e-324},
         {"delta_mm": None, "gamma_mm": 1e-3, "m": 20, "device": "falcon"},

@@ -116,3 +116,14 @@ def test_breath_is_followed_and_the_pose_is_that_of_rest(breathing, monkeypatch)
     assert along - AXIS @ sure.covariance[:3, :3] @ AXIS == pytest.approx(rest_mm**2)
     assert "the heart is taken to rest" not in found["free"].reason
     assert "the heart is taken to rest" in sure.reason
+
+
+@pytest.mark.parametrize(("depth_mm", "told"), [(1.9, False), (2.1, True)])
+def test_full_lungs_are_told_of_breaths_deeper_than_two_millimetres(depth_mm, told):
+    """Three tenths of the frames at the end of expiration, the others at that of inspiration."""
+    assert is_mostly_inspired(depth_mm * (np.arange(100) >= 30)) == told
+
+
+@pytest.mark.parametrize(("inspired", "told"), [(45, False), (55, True)])
+def test_full_lungs_are_those_of_most_frames(inspired, told):
+    assert is_mostly_inspired(9.0 * (np.arange(100) < inspired)) == told

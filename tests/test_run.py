@@ -24,10 +24,18 @@ import pytest
 from kitchen import Kitchen, Silent
 
 from pipeline import run as runner
+from pipeline import sealing
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
-from pipeline.publish import PARTIAL, only_run_in, publishing, readable_write_errors
+from pipeline.publish import (
+    PARTIAL,
+    only_run_in,
+    publishing,
+    readable_write_errors,
+    remove_partials,
+    write_json,
+)
 from pipeline.sealing import LIBRARIES, code_digest
 from pipeline.study import open_study
 
@@ -82,7 +90,9 @@ def test_a_changed_setting_runs_only_the_stages_that_read_it(kitchen: Kitchen) -
     # b's product came out the same, so c still holds.
 
 
-@pytest.mark.parametrize("key", ["rr_ms: 800", "fill_gaps: true", "spoilt_slices: [2]"])
+@pytest.mark.parametrize(
+    "key", ["rr_ms: 800", "fill_gaps: true", "spoilt_slices: [2]", "leave_out_series: [3]"]
+)
 def test_what_study_yaml_says_of_the_cine_counts_as_input(kitchen: Kitchen, key: str) -> None:
     kitchen.run()
     (kitchen.folder / "study.yaml").write_text(f"cine: {{{key}}}\n")
@@ -496,3 +506,123 @@ def test_peak_memory_is_that_of_the_stretch_and_not_of_the_past() -> None:
     time.sleep(0.01)
     assert grown.megabytes() >= before + 250
     assert PeakMemory().megabytes() < before + 250
+
+
+def test_other_libraries_run_again(kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch) -> None:
+    kitchen.run()
+    monkeypatch.setattr(runner, "library_versions", lambda: {"numpy": "0"})
+    kitchen.run()
+    assert kitchen.calls == ["a", "b", "c"]
+
+
+def test_products_are_not_taken_over_under_another_patient_id(kitchen: Kitchen) -> None:
+    """The field and the report carry it: renamed folders are not renamed products."""
+    kitchen.run()
+    (kitchen.out / "p1").rename(kitchen.out / "p2")
+    (kitchen.folder / "study.yaml").write_text("patient_id: p2\n")
+    assert kitchen.run() == dict.fromkeys("abc", "done")
+    assert kitchen.calls == ["a", "b", "c"]
+
+
+def test_another_reason_for_none_runs_the_stage_that_tells_it(
+    kitchen: Kitchen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing was made before and nothing is now; a report would go on telling the old cause."""
+    last = runner.Stage("c", after=("a", "b"), repeats_reasons=True)
+    monkeypatch.setattr(runner, "STAGES", (*runner.STAGES[:2], last))
+
+    def tell(job: Job) -> dict[str, Any]:
+        (job.folder / "text").write_text(job.skipped["b"])
+        return {}
+
+    kitchen.bodies["c"] = tell
+    for cause, spacing_mm in (("no ultrasound", 2.0), ("no heart in view", 3.0)):
+
+        def skip(job: Job, cause: str = cause) -> dict[str, Any]:
+            raise Skipped(cause)
+
+        kitchen.bodies["b"] = skip
+        kitchen.run(Settings.model_validate({"bake": {"spacing_mm": spacing_mm}}))
+        assert kitchen.text("c") == cause
+
+
+def test_what_lies_where_a_stage_made_nothing_is_not_left_for_later_ones(kitchen: Kitchen) -> None:
+    """A folder that somebody put there is no product, and later stages would read it."""
+
+    def skip(job: Job) -> dict[str, Any]:
+        raise Skipped("no ultrasound")
+
+    kitchen.bodies |= {"b": skip, "c": lambda job: {"without b": job.product("b") is None}}
+    kitchen.run()
+    (kitchen.out / "p1" / "b").mkdir()
+    (kitchen.out / "p1" / "b" / "text").write_text("of another patient")
+    kitchen.run(first="c")
+    assert kitchen.record()["stages"]["c"]["figures"] == {"without b": True}
+
+
+def test_a_product_altered_while_the_study_runs_goes_into_no_other(kitchen: Kitchen) -> None:
+    """When the run came to it, it was as it had been sealed."""
+
+    def alter(job: Job) -> dict[str, Any]:
+        (job.products / "a" / "text").write_text("altered")
+        return {}
+
+    kitchen.bodies["b"] = alter
+    with pytest.raises(InputError, match=r"a/text: is not what the stage a wrote"):
+        kitchen.run()
+    assert kitchen.calls == ["a", "b"]
+    assert not (kitchen.out / "p1" / "c").exists()
+
+
+def test_nobody_clears_up_within_a_swap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process that did would put the old product back into the new one's place."""
+    target, rename = tmp_path / "stage", Path.rename
+    with publishing(target) as folder:
+        (folder / "text").write_text("old")
+
+    def looked_at(path: Path, to: Path) -> Path:
+        moved = rename(path, to)
+        if path == target:
+            remove_partials(tmp_path)
+            assert not target.exists()
+        return moved
+
+    monkeypatch.setattr(Path, "rename", looked_at)
+    with publishing(target) as folder:
+        (folder / "text").write_text("new")
+    assert (target / "text").read_text() == "new"
+    assert [one.name for one in tmp_path.iterdir()] == ["stage"]
+
+
+def test_killed_behind_the_renames_of_a_swap_leaves_the_new_product(tmp_path: Path) -> None:
+    """The old one is cleared away, and stops no later run."""
+    for name, content in ((f".stage{PARTIAL}old-{os.getppid()}", "old"), ("stage", "new")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "text").write_text(content)
+    with only_run_in(tmp_path):
+        assert (tmp_path / "stage" / "text").read_text() == "new"
+        assert not list(tmp_path.glob(f".*{PARTIAL}*"))
+
+
+def test_who_reads_a_record_while_it_is_written_reads_a_whole_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    write_json(path, {"status": "running"})
+    with path.open() as reader:
+        write_json(path, {"status": "done"})
+        assert json.load(reader) == {"status": "running"}
+    assert json.loads(path.read_text()) == {"status": "done"}
+
+
+def test_networks_beside_the_code_count_for_what_it_makes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other weights make other labels, of the same code."""
+    weights = tmp_path / "imaging" / "weights" / "network.onnx"
+    weights.parent.mkdir(parents=True)
+    (tmp_path / "imaging" / "labels.py").write_text("import numpy\n")
+    monkeypatch.setattr(sealing, "PACKAGE", tmp_path)
+    found = []
+    for content in (b"trained", b"trained longer", b"trained"):
+        weights.write_bytes(content)
+        found.append(code_digest.__wrapped__("pipeline.imaging.labels"))
+    assert found[0] == found[2] != found[1]

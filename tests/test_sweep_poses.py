@@ -12,6 +12,7 @@ from sweep_files import FRAMES, PIXELS, calibration, good_fields, rigid, text, w
 
 from pipeline.errors import InputError
 from pipeline.geometry import require_rigid
+from pipeline.imaging.sweep_poses import require_resting
 from pipeline.imaging.ultrasound import read_sweep, read_sweeps, remarks_on
 from pipeline.products import write_slicer_transform
 from pipeline.run import STAGES, _described
@@ -344,3 +345,15 @@ def test_what_mirrors_stretches_or_projects_is_no_rigid_motion(wrong, words):
     require_rigid(np.eye(4), "here")
     with pytest.raises(InputError, match=words):
         require_rigid(wrong, "here")
+
+
+@pytest.mark.parametrize(("away_mm", "rests"), [(0.75, True), (0.85, False)])
+def test_eight_tenths_of_a_millimetre_are_the_most_that_noise_does(away_mm, rests):
+    """Back and forth by as much about the middle: that is the root mean square, too."""
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = away_mm * (-1.0) ** np.arange(40)
+    if rests:
+        require_resting(list(poses), np.zeros(3), "us")
+    else:
+        with pytest.raises(InputError, match=rf"moves against the tracker, by {away_mm:.1f} mm"):
+            require_resting(list(poses), np.zeros(3), "us")
