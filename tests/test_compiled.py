@@ -12,6 +12,7 @@ import pipeline
 from data_synth import kernels as phantom
 from pipeline.compiled import kept_with
 from pipeline.evaluation import compiled as dissection
+from pipeline.field import fit_kernels as fit
 from pipeline.field import kernels as field
 from pipeline.registration import compiled as clock
 
@@ -45,6 +46,9 @@ def test_what_compiled_code_takes_from_elsewhere_tells_it_apart_too():
     assert {"operators", *(f"../field/{name}" for name in ("potential", "kernels"))} <= {
         *dissection._SOURCES
     }
+    # Parts of kernels are written in the compiler's own language there.
+    for sources in (field._SOURCES, dissection._SOURCES, fit._SOURCES[1]):
+        assert "../compiled" in sources
 
 
 @pytest.mark.parametrize("package", [pipeline, data_synth], ids=["pipeline", "phantom"])

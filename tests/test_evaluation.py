@@ -358,7 +358,18 @@ def test_phases_of_truth_are_brought_to_the_beat_of_the_mr(tmp_path):
     assert np.abs(apart).max() > 0.05
     np.testing.assert_allclose(_frame_phase_errors(job, known), apart, atol=1e-6)
     known["settings"] = {"heart_rate_bpm": 75.0}
+    for turns in (0, 1, -1):
+        known["us_frames"]["fan"]["mechanical_phases"] = [one + turns for one in true]
+        np.testing.assert_allclose(_frame_phase_errors(job, known), 0, atol=1e-6)
+    known["us_frames"]["fan"]["mechanical_phases"] = [-1e-17, *true[1:]]
     np.testing.assert_allclose(_frame_phase_errors(job, known), 0, atol=1e-6)
+    for wrong in ("75", [75], True, -75, 0, float("nan"), float("inf")):
+        known["settings"] = {"heart_rate_bpm": wrong}
+        with pytest.raises(InputError, match=r"truth\.json: settings\.heart_rate_bpm is"):
+            _frame_phase_errors(job, known)
+    for without in (None, [], "x", {}):
+        known["settings"] = without
+        np.testing.assert_allclose(_frame_phase_errors(job, known), apart, atol=1e-6)
 
 
 def test_the_headline_is_the_worst_phase_and_every_structure_sound():

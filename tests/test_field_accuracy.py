@@ -19,7 +19,7 @@ from pipeline.field.certificate import BAND_MM
 from pipeline.field.distance import distance_of_closed
 from pipeline.field.motion import Motion
 from pipeline.field.spline import space_coefficients
-from pipeline.field.surface_fit import fit_to_surface
+from pipeline.field.surface_fit import _Places, fit_to_surface
 from pipeline.field.verify import verify_field
 from pipeline.geometry import Grid, MovingSurface, Surface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field
@@ -261,6 +261,31 @@ def test_the_fit_is_the_same_by_any_number_of_threads(count):
         assert fit_to_surface(splines, phases, grid, ball, 3, threads) > 0.1
         fitted[threads] = np.stack(splines).tobytes()
     assert fitted[1] == fitted[2] == fitted[8]
+
+
+@pytest.mark.parametrize("nodes", [20, 41, 300])
+def test_no_point_asks_for_a_node_beyond_the_grids_end(nodes):
+    """As it is rounded to single precision, and written: three nodes about the nearest one."""
+    grid = Grid((nodes,) * 3, (0.0,) * 3, (1.0,) * 3)
+    away = np.concatenate([[0.0], np.geomspace(1e-14, 1e-2, 200)])
+    ends = np.concatenate([0.5 - away, 0.5 + away, nodes - 1.5 - away, nodes - 1.5 + away])
+    points = np.full((len(ends), 3), nodes / 2)
+    points[:, 1] = ends
+    held = _Places(0.0, points, np.zeros(len(ends))).inside(grid).points_mm
+    middle = (held.astype(np.float32) + np.float32(0.5)).astype(int)
+    assert middle.min() == 1
+    assert middle.max() == nodes - 2
+    # What lies farther within than rounding may matter is left.
+    assert len(held) >= np.count_nonzero((ends >= 0.5) & (ends < nodes - 1.502))
+
+
+@pytest.mark.parametrize("off_mm", 10.0 ** np.array([-23.75, -22.5, -22]))
+def test_nothing_is_fitted_where_next_to_nothing_is_off(off_mm):
+    """So little that its square is nought in single precision."""
+    grid, phases = Grid((20,) * 3, (0.0,) * 3, (1.0,) * 3), np.arange(8) / 8
+    ball = SurfaceSeries((sphere(5.0, 2, (9.5, 9.5, 9.5)),) * 8, phases)
+    splines = list(np.full((8, 20, 20, 20), off_mm, dtype=np.float32))
+    assert fit_to_surface(splines, phases, grid, ball, 3) < 1e-20
 
 
 def test_what_rests_beside_what_moves_is_measured_anew(tmp_path):

@@ -10,6 +10,7 @@ from pipeline.field.kernels import ASKED, INNER
 _SOURCES = (
     *("rod", "dissection_forces", "dissection_loop", "dissection_values", "operators"),
     *(f"../field/{name}" for name in ("potential", "kernels", "tool_kernels")),
+    "../compiled",
 )
 
 

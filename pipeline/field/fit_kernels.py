@@ -9,19 +9,23 @@ from __future__ import annotations
 
 import functools
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pipeline.compiled import mixed, place_of, spread
+from pipeline.compiled import door, mixed, place_of, spread
 from pipeline.geometry import Float32
 
 # Minima and maxima aside, only the order of sums may change.
 FAST = {"contract", "nnan", "nsz"}
+
+_SOURCES = Path(__file__).parent, ("fit_kernels", "../compiled")
+_ASKED: dict[str, Any] = {"nogil": True, "cache": True, "fastmath": FAST}
 
 _FOUR = ir.VectorType(ir.FloatType(), 4)
 
@@ -31,7 +35,7 @@ def room(shape: tuple[int, ...]) -> Float32:
     return np.zeros(math.prod(shape) + 1, dtype=np.float32)[:-1].reshape(shape)
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def mix(coefficients, interval, weights, layer, shell):  # type: ignore[no-untyped-def]
     """Coefficients at one moment: those of three phases, weighted."""
     count, into = len(coefficients), layer.ravel()
@@ -42,7 +46,7 @@ def mix(coefficients, interval, weights, layer, shell):  # type: ignore[no-untyp
         into[shell[n]] = early * before[n] + middle * at[n] + late * after[n]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def share(target, interval, weights, acting, shell):  # type: ignore[no-untyped-def]
     """Add what acts at one moment to three phases, by their weights; nothing acts any more."""
     count, given = len(target), acting.ravel()
@@ -57,7 +61,7 @@ def share(target, interval, weights, acting, shell):  # type: ignore[no-untyped-
         after[n] += late * one
 
 
-@njit(nogil=True, cache=True, fastmath=FAST, inline="always")
+@door(*_SOURCES, **_ASKED, inline="always")
 def _weigh(place):  # type: ignore[no-untyped-def]
     """First of the three nodes about a place on an axis, and their weights."""
     half = np.float32(0.5)
@@ -67,7 +71,7 @@ def _weigh(place):  # type: ignore[no-untyped-def]
     return middle - 1, (half * early * early, np.float32(0.75) - t * t, half * late * late)
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def touch(touched, nodes):  # type: ignore[no-untyped-def]
     """Mark the nodes that points ask."""
     for n in range(len(nodes)):
@@ -149,7 +153,7 @@ def _add(typing_context: Any, first: Any, steps: Any, shares: Any, value: Any) -
     return types.void(first, steps, shares, value), generate
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def gather(layer, nodes, found):  # type: ignore[no-untyped-def]
     """Interpolated distances at points of one moment; ``layer`` has ``room``."""
     height, width = layer.shape[1], layer.shape[2]
@@ -162,7 +166,7 @@ def gather(layer, nodes, found):  # type: ignore[no-untyped-def]
         found[n] = _ask(first, steps, wx, wy, wz)
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def scatter(layer, nodes, values):  # type: ignore[no-untyped-def]
     """Add to every coefficient the values of the points that it acts on, by its weight there."""
     height, width = layer.shape[1], layer.shape[2]
@@ -175,7 +179,7 @@ def scatter(layer, nodes, values):  # type: ignore[no-untyped-def]
         _add(first, steps, (wx, wy, wz), values[n])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST)
+@door(*_SOURCES, **_ASKED)
 def scatter_squares(layer, nodes, values):  # type: ignore[no-untyped-def]
     """The same by the squares of the weights."""
     height, width = layer.shape[1], layer.shape[2]

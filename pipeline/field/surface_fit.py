@@ -131,7 +131,9 @@ def fit_to_surface(
         touch(touched, moment.nodes)
     shell = np.flatnonzero(touched).astype(np.uint32)
     near = np.stack([one[box].ravel()[shell] for one in splines])
-    with ThreadPoolExecutor(threads or processors()) as pool:
+    # No more runs than this are apart, and each thread has room of its own.
+    threads = min(threads or processors(), max(1, len(phases) // 4))
+    with ThreadPoolExecutor(threads) as pool:
         change = _Fit(near, shell, shape, moments, step_mm, pool).after(rounds)
     for spline, moved in zip(splines, change, strict=True):
         part = np.zeros(shape, dtype=np.float32)
@@ -154,7 +156,8 @@ class _Places:
     def inside(self, grid: Grid) -> _Places:
         """Those whose three nodes an axis are all in the grid."""
         nodes = (self.points_mm - grid.origin_mm) / np.array(grid.spacing_mm)
-        held = ((nodes >= 0.5) & (nodes < np.array(grid.shape[::-1]) - 1.5)).all(1)
+        # The last thousandth would be none, rounded to single precision.
+        held = ((nodes >= 0.5) & (nodes < np.array(grid.shape[::-1]) - 1.501)).all(1)
         return _Places(self.phase, self.points_mm[held], self.unsure_mm[held])
 
 
@@ -311,11 +314,13 @@ class _Fit:
         for _ in range(STEPS_A_ROUND):
             self._find_slope(slope)
             before, length2 = length2, sum(self._of_each(rise, self._change))
+            # Nothing is left to do on a surface that the spline already has.
+            if length2 == 0:
+                break
             kept = np.float32(length2 / before)
             curvature = DAMPING * sum(self._of_each(turn, way))
             along = self._values(way)
             curvature += sum(self._of_each(curving, along))
-            # Nothing is left to do on a surface that the spline already has.
             if curvature == 0:
                 break
             step = np.float32(length2 / curvature)

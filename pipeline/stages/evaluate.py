@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -239,11 +240,20 @@ def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
 def _axis(job: Job, known: dict[str, Any]) -> Callable[[float], Any]:
     """How a phase of truth's beat, which lasts what the heart rate asked for says, is brought to
     the MR's mean beat, whose phases the frames have: as it is where one of the two is not known."""
-    rate_bpm = known.get("settings", {}).get("heart_rate_bpm")
-    cycle_rr_s = read_table(job.products / "ingest" / "phases.json")["rr_s"] if rate_bpm else None
+    settings = known.get("settings")
+    rate_bpm = settings.get("heart_rate_bpm") if isinstance(settings, dict) else None
+    if rate_bpm is None:
+        return np.asarray
+    if type(rate_bpm) not in (int, float) or not 0 < rate_bpm < math.inf:
+        raise InputError(
+            f"{job.study.folder / 'truth' / 'truth.json'}: settings.heart_rate_bpm is "
+            f"{rate_bpm!r}; give truth's beats a minute, or take it out"
+        )
+    cycle_rr_s = read_table(job.products / "ingest" / "phases.json")["rr_s"]
     if cycle_rr_s is None:
         return np.asarray
-    return lambda phase: to_cycle(phase, 60 / rate_bpm, cycle_rr_s)
+    # Twice, for of a little less than 0 the rest is 1.
+    return lambda phase: to_cycle(phase % 1.0 % 1.0, 60 / rate_bpm, cycle_rr_s)
 
 
 def _headline(metrics: dict[str, Any]) -> dict[str, Any]:
