@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from batch_program import rows_of, stand_in
 
-from pipeline.batch_table import outcome_of
+from pipeline.batch_table import outcome_of, rows
 from pipeline.cli import main
 from pipeline.errors import NOT_TO_BE_USED as OLD
 
@@ -162,3 +162,8 @@ def test_ultrasound_that_was_not_registered_is_told_from_none(cause: str, verdic
     outcome = outcome_of("a", "done", "", "a", Path("a"), record=record).outcome
     assert outcome.registration == verdict
     assert outcome.remarks == (f"not registered: {cause}" if verdict else "")
+
+
+def test_studies_of_which_no_images_are_known_are_not_called_the_same() -> None:
+    ended = [outcome_of(name, "failed", "no cine", "", Path(name)) for name in "ab"]
+    assert [one.remarks for one in rows(ended)] == ["", ""]

@@ -8,6 +8,7 @@ import pytest
 import pyvista
 from field_baked import FIXTURES, RR_S, SETTINGS, bake_small
 from field_shapes import beating, box, lumpy, sphere
+from scipy.interpolate import CubicSpline
 
 from data_synth.population import draw_heart
 from pipeline.config import Settings
@@ -17,7 +18,7 @@ from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
 from pipeline.field.distance import distance_of_closed
-from pipeline.field.motion import Motion
+from pipeline.field.motion import Motion, halfway
 from pipeline.field.spline import space_coefficients
 from pipeline.field.surface_fit import _Places, fit_to_surface
 from pipeline.field.verify import verify_field
@@ -203,6 +204,29 @@ def test_a_guess_between_few_phases_bends_the_distance_about_the_surface_less(
         else:
             assert weighed[name] == alike[name]
     assert weighed["motion_unsure_p99_mm"] > (0.5 if count == 9 else 0.01)
+
+
+@pytest.mark.parametrize(("count", "share"), [(7, 1.0), (8, 0.2)])
+def test_eight_phases_follow_a_beat_by_the_fifth_degree_and_seven_by_the_third(count, share):
+    """Truth: a cosine, and what SciPy's cubic spline misses it by."""
+    phases = np.arange(count) / count
+    places_mm = np.zeros((count, 3, 3))
+    places_mm[:, 0, 0] = np.cos(2 * np.pi * phases)
+    motion = Motion.of(MovingSurface(places_mm, np.array([[0, 1, 2]]), phases))
+    asked = np.linspace(0, 1, 101)
+    true_mm = np.cos(2 * np.pi * asked)
+    cubic = CubicSpline(np.append(phases, 1), np.append(places_mm[:, 0, 0], 1), bc_type="periodic")
+    found_mm = np.array([motion.at(phase).vertices_mm[0, 0] for phase in asked])
+    off_mm, cubic_mm = np.abs(found_mm - true_mm).max(), np.abs(cubic(asked) - true_mm).max()
+    if share == 1:
+        assert off_mm == pytest.approx(cubic_mm)
+    else:
+        assert off_mm < share * cubic_mm
+
+
+def test_halfway_is_between_neighbours_of_the_beat_but_in_no_gap():
+    np.testing.assert_allclose(halfway(np.array([0.1, 0.4, 0.7])), [0.25, 0.55, 0.9])
+    np.testing.assert_allclose(halfway(np.array([0.0, 0.1, 0.2, 0.3])), [0.05, 0.15, 0.25])
 
 
 @pytest.mark.parametrize("end", [1.0, 0.9, 0.8, 0.7])

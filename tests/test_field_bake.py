@@ -16,13 +16,18 @@ from pipeline.errors import InputError, StageError
 from pipeline.exact import ExactSurface, points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
-from pipeline.field.certificate import certify, require_bounds
+from pipeline.field.certificate import _largest, certify, require_bounds
 from pipeline.field.fixture import Bounds
 from pipeline.field.manifest import write_manifest
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface
-from pipeline.own_surfaces import bake_own_surfaces, measure_field, what_was_baked
+from pipeline.own_surfaces import (
+    _fixtures_for,
+    bake_own_surfaces,
+    measure_field,
+    what_was_baked,
+)
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
 
@@ -62,6 +67,8 @@ def test_certificate_is_what_an_independent_check_finds(tmp_path):
     assert 0.3 < error.max() / said["distance_error_max_mm"] < 3
     # The interpolant of an exact field of slope 1 errs by less than half a voxel anywhere.
     assert said["distance_error_max_mm"] < 1.0
+    on_mm = np.abs(field.distance_mm(points_about(surface, np.random.default_rng(98), 4000, 0), 0))
+    assert np.percentile(on_mm, 99) == pytest.approx(said["surface_error_p99_mm"], rel=0.3)
 
 
 def test_certificate_has_a_figure_for_each_part(tmp_path):
@@ -143,6 +150,40 @@ def test_force_change_is_bounded_by_stiffness_and_motion(tmp_path):
     assert said["force_change_max_n_per_ms"] <= ((stiffness * motion_mm + turning) / gap_ms).max()
     # The fastest motion, 3 mm in a quarter beat, is felt where the potential is steepest.
     assert said["force_change_max_n"] >= 0.5 * stiffness * motion_mm.max()
+
+
+def test_the_change_from_the_last_phase_to_the_first_counts(tmp_path):
+    """Truth: the forces at all nodes. The ball grows from phase to phase and falls back at once."""
+    ball = beating(sphere(1.0, 2), np.array([15.0, 17.0, 19.0]), np.arange(3) / 3)
+    settings = SETTINGS.model_copy(update={"bounds": Bounds(surface_error_p99_spacings=1)})
+    laws = {"g": FIXTURES["guide"]}
+    said = bake_field(tmp_path / "f.zarr", {"ball": ball}, laws, settings, rr_s=RR_S)
+    field = ForceField.open(tmp_path / "f.zarr")
+    nodes_mm = field.grid.nodes_mm().reshape(-1, 3)
+    forces_n = [field.force_n(nodes_mm, phase) for phase in field.phases]
+    changes_n = [
+        np.linalg.norm(after - before, axis=1).max()
+        for before, after in zip(forces_n, forces_n[1:] + forces_n[:1], strict=True)
+    ]
+    assert changes_n[2] > 1.2 * max(changes_n[:2])
+    assert said["force_change_max_n"] == pytest.approx(changes_n[2], rel=1e-6)
+    # Fastest halfway back; of random places and moments some come near.
+    late_n = field.force_n(nodes_mm, 5 / 6 + 0.001 / RR_S) - field.force_n(nodes_mm, 5 / 6)
+    fastest_n = np.linalg.norm(late_n, axis=1).max()
+    assert 0.8 * fastest_n < said["force_change_max_n_per_ms"] < 1.25 * fastest_n
+    assert said["force_rate_max_n_per_mm"] == pytest.approx(
+        10 * said["force_step_max_n_per_0_1_mm"]
+    )
+
+
+def test_what_is_unknown_of_one_part_is_unknown_of_all():
+    known, unknown = (
+        {"drift_max_mm": 0.1, "sign_errors": 2},
+        {"drift_max_mm": None, "sign_errors": 3},
+    )
+    for parts in ((known, unknown), (unknown, known)):
+        largest = _largest(dict(zip("ab", parts, strict=True)))
+        assert largest == {"drift_max_mm": None, "sign_errors": 5}
 
 
 def test_rates_are_unknown_without_a_heart_rate(tmp_path):
@@ -353,6 +394,43 @@ def test_how_a_field_was_baked_may_be_said_otherwise(folder, tmp_path, said):
     (baked / "manifest.json").unlink()
     write_manifest(baked)
     assert measure_field(baked, folder)["sign_errors"] == 0
+
+
+def test_a_field_is_measured_anew_by_the_bounds_that_it_was_baked_to(folder, tmp_path):
+    baked = bake_own_surfaces(folder, tmp_path / "out", own_settings(fit_rounds=0))
+    content = json.loads((baked / "zarr.json").read_text())
+    said = content["attributes"]["beatfield"]["source"]["bake"]
+    said["bounds"]["surface_error_p99_spacings"] = 1e-6
+    (baked / "zarr.json").write_text(json.dumps(content))
+    (baked / "manifest.json").unlink()
+    write_manifest(baked)
+    with pytest.raises(StageError, match=r"surface_error_p99_mm is .* allowed is 4e-06"):
+        measure_field(baked, folder)
+
+
+def test_what_was_baked_is_told_with_the_figures_of_its_certificate(folder, tmp_path):
+    baked = bake_own_surfaces(folder, tmp_path / "out", own_settings(fit_rounds=0))
+    said = ForceField.open(baked).accuracy
+    on, about = (f"{said[f'{one}_error_p99_mm']:.2g} mm" for one in ("surface", "distance"))
+    assert on != about
+    told = what_was_baked(baked)
+    assert told[1].startswith(
+        f"accuracy  {on} off on the surfaces at most and {about} within 15 mm"
+    )
+    assert told[2].startswith(
+        "fixture   hold: guidance of box, 2 N at most, next to nothing within"
+    )
+
+
+def test_default_fixtures_stay_and_every_other_surface_is_guided_to():
+    fixtures = _fixtures_for(["left_atrium", "mine"], Settings())
+    assert {name: one.structure for name, one in fixtures.items()} == {
+        "left_atrium_guidance": "left_atrium",
+        "mine_guidance": "mine",
+    }
+    assert fixtures["left_atrium_guidance"].resolved_gamma_mm == 2.5
+    both = _fixtures_for(["epicardium"], Settings())
+    assert set(both) == {"epicardium_guidance", "left_ventricle_forbidden"}
 
 
 def test_timing_and_tracker_of_ones_own(folder, tmp_path):

@@ -1,13 +1,14 @@
 """The store on disk: the format's promises, and that no damage goes unseen."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, bake_small
-from field_random import ORIGIN_MM, SPACING_MM, write_random
+from field_random import EVEN, ORIGIN_MM, SPACING_MM, write_random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -169,10 +170,12 @@ def test_missing_and_cut_files_are_found(copy, name):
 def test_added_files_are_found(copy):
     (copy / "distance" / "more").write_text("x")
     (copy / "link").symlink_to("/nowhere")
+    (copy / "way").symlink_to(copy.parent)
 
     with pytest.raises(InputError, match="distance/more: is not in the manifest") as refusal:
         verify_field(copy)
     assert "link: is not in the manifest" in str(refusal.value)
+    assert "way: is not in the manifest" in str(refusal.value)
 
 
 @pytest.mark.parametrize(
@@ -180,6 +183,7 @@ def test_added_files_are_found(copy):
     [
         (lambda b: b.update(frame="RAS"), r"beatfield\.frame"),
         (lambda b: b.update(phases=[0.5, 0.1]), "phases must rise"),
+        (lambda b: b.update(phases=[0.1, 0.2, 0.45, 0.5, 1.0]), "phases must rise"),
         (lambda b: b.update(phases=[0.0, 0.0004]), "shares of a cycle, not seconds"),
         (lambda b: b.update(surprise=1), r"beatfield\.surprise: Extra inputs.* another version"),
         (lambda b: b.pop("source"), r"beatfield\.source: Field required.* another version"),
@@ -190,6 +194,15 @@ def test_added_files_are_found(copy):
             "guide: phase 0 is not the formula",
         ),
         (lambda b: b["fixtures"]["guide"].update(structure="x"), "no structure 'x'"),
+        (
+            lambda b: b["structures"]["ball"].update(volume_ml=[math.nan] * 5),
+            r"structures\.ball\.volume_ml\.0",
+        ),
+        (lambda b: b["structures"]["ball"]["volume_ml"].pop(), "one a phase, not 5 and 4"),
+        (
+            lambda b: b["structures"]["core"].update(spline="spline/ball"),
+            "core: spline 'spline/ball' is not its own",
+        ),
         (lambda b: b["grid"].update(origin_mm=[9.0, 0.0, 0.0]), "ome and beatfield disagree"),
         (lambda b: b["grid"].update(spacing_mm=[2.7] * 3), "ome and beatfield disagree"),
         (lambda b: b.update(rr_s=800.0), "ome and beatfield disagree"),
@@ -226,7 +239,7 @@ def test_a_store_may_name_a_known_device_alone(copy):
         ForceField.open(copy)
 
 
-@pytest.mark.parametrize("array", ["distance/ball", "potential/stay_out"])
+@pytest.mark.parametrize("array", ["distance/ball", "potential/stay_out", "spline/core"])
 def test_sealed_values_that_are_no_numbers_are_found(copy, array):
     chunk = copy / array / "c" / "3" / "0" / "0" / "0"
     values = np.fromfile(chunk, dtype="<f4")
@@ -295,6 +308,7 @@ def test_a_store_without_manifest_is_none(copy, tmp_path):
     [
         ("mr_from_tracker", np.diag([2.0, 1, 1, 1]).tolist(), "mr_from_tracker: is not a rotation"),
         ("phases", [0.0, 0.5, 0.99995], "lie 5e-05 of a cycle apart"),
+        ("rr_s", 0.0, r"\.rr_s: .* greater than 0"),
         (
             "phases",
             [0.0, 0.1, 0.2, 0.5],
@@ -374,3 +388,29 @@ def test_a_sealed_spline_that_is_a_micrometre_off_is_found(copy):
     rewrite(copy, lambda mm: mm + 1e-3, arrays=("spline/ball",))
     with pytest.raises(InputError, match=r"spline/ball: phase 0 misses distance/ball by 0\.001 mm"):
         verify_field(copy)
+
+
+def test_in_oblong_voxels_a_distance_changes_by_the_way_along_its_own_axis(tmp_path):
+    """A flat wall across x, whose nodes lie twice as far apart as those along z."""
+    path = tmp_path / "f.zarr"
+    write_random(path, 7, EVEN[:1])
+    law = ForceField.open(path).fixtures["f"]
+    x_mm = ORIGIN_MM[0] + SPACING_MM[0] * np.arange(7)
+
+    def write_wall(slope):
+        wall_mm = np.broadcast_to(slope * x_mm, (3, 5, 7)).astype(np.float32)
+        offence_mm = offence(wall_mm.astype(float), law.side_code)
+        stored = potential(offence_mm, law.resolved_delta_mm, law.m)
+        for array, values in (
+            ("distance/s", wall_mm),
+            ("spline/s", wall_mm),
+            ("potential/f", stored),
+        ):
+            values.astype("<f4").tofile(path / array / "c" / "0" / "0" / "0" / "0")
+        edit(path, lambda b: b["structures"]["s"].update(volume_ml=[0.1]))
+
+    write_wall(1.0)
+    assert verify_field(path)
+    write_wall(1.02)
+    with pytest.raises(InputError, match=r"changes by 1\.53 mm between nodes that lie 1\.5 mm"):
+        verify_field(path)

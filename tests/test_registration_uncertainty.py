@@ -15,6 +15,7 @@ from scipy.stats import chi
 from pipeline.errors import StageError
 from pipeline.geometry import transform_points
 from pipeline.registration import space
+from pipeline.registration.clock_offset import ClocksApart
 from pipeline.registration.dissent import NONE, longest_astray, outvoted
 from pipeline.registration.frames import Samples
 from pipeline.registration.parts import Apart
@@ -29,6 +30,7 @@ from pipeline.registration.uncertainty import (
     floor_of,
     in_radians,
     motion_between,
+    rising,
     sandwich,
     slopes_at,
 )
@@ -230,6 +232,10 @@ class TestVerdict:
             ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
             ({"outvoted": (2,), "elsewhere_mm": 5.2}, "and agree on a place 5 mm away"),
             ({"inspired": True}, "the heart is taken to rest"),
+            (
+                {"clocks": ClocksApart(ahead=2, behind=1, by_s=0.15)},
+                "time stamps of sweep 2 are 0.15 s ahead of those of sweep 1 by",
+            ),
             ({"size": Size(-0.08, 0.1)}, "agree 10% better with a heart 8% smaller than"),
             ({"apart": 0.07}, "parts of the recording agree 7% better with poses of their own"),
         ],
@@ -385,3 +391,17 @@ def test_ten_frames_in_a_row_that_go_astray_put_a_result_in_doubt():
     said = judge(Evidence(**(SOUND | {"astray": (10, 2)})), RegisterSettings(min_frames=20))
     assert said.grade == "doubtful"
     assert "10 frames in a row of sweep 2 show the heart" in said.reason
+
+
+def test_what_bends_downwards_is_taken_out_and_the_rest_is_as_it_was():
+    axes = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+    found = rising(axes @ np.diag([3.0, 1.0, -2.0]) @ axes.T)
+    np.testing.assert_allclose(found, axes @ np.diag([3.0, 1.0, 0.0]) @ axes.T, atol=1e-12)
+
+
+def test_a_slope_that_all_frames_share_is_no_spread_between_them():
+    slopes = np.random.default_rng(3).normal(size=(40, 6))
+    apart, shared = (
+        sandwich(Curvature(slopes + both, BENDING), np.repeat([0, 1], 20)) for both in (0.0, 0.7)
+    )
+    np.testing.assert_allclose(apart, shared, rtol=1e-9, atol=1e-12)

@@ -353,7 +353,7 @@ def test_phases_too_few_to_tell_where_walls_are_between_them_are_told():
             "volumes: the left ventricle ejects 80 ml and the right one 67 ml",
         ),
         (
-            {"cut_sideways": {"left ventricle": {"3": 9}}},
+            {"cut_sideways": {"left ventricle": 9}},
             {"volumes_ml": {"lv_endocardium": [150.0, 70.0], "rv_endocardium": [160.0, 99.0]}},
             None,
         ),
@@ -373,3 +373,20 @@ def test_what_speaks_against_labels_and_times_is_told(
 ) -> None:
     said = doubts(segment, surface)
     assert [one[: len(words or "")] for one in said] == ([] if words is None else [words])
+
+
+def test_what_is_cut_at_the_sides_and_what_is_left_out_is_told_of_the_run() -> None:
+    stages = {
+        "ingest": {"status": "done", "figures": {"phases": 9}},
+        "segment": {"status": "done", "figures": {"cut_sideways": {"aorta": 4, "heart": 4}}},
+        "register": {"status": "done", "figures": {"remarks": ["sweep 2 stands still"]}},
+        "bake": {"status": "done", "figures": {"left_out": {"valve": "unseen", "apex": "unseen"}}},
+    }
+    assert remarks(stages) == [
+        ("input", "sweep 2 stands still"),
+        (
+            "cut off",
+            "aorta, heart at the images' edge in 4 of 9 phases: surfaces and volumes end there",
+        ),
+        ("left out", "fixture valve, apex: unseen"),
+    ]
