@@ -71,6 +71,12 @@ def _weigh(place):  # type: ignore[no-untyped-def]
     return middle - 1, (half * early * early, np.float32(0.75) - t * t, half * late * late)
 
 
+@door(*_SOURCES, **_ASKED, inline="always")
+def _squares(weights):  # type: ignore[no-untyped-def]
+    a, b, c = weights
+    return a * a, b * b, c * c
+
+
 @door(*_SOURCES, **_ASKED)
 def touch(touched, nodes):  # type: ignore[no-untyped-def]
     """Mark the nodes that points ask."""
@@ -167,31 +173,16 @@ def gather(layer, nodes, found):  # type: ignore[no-untyped-def]
 
 
 @door(*_SOURCES, **_ASKED)
-def scatter(layer, nodes, values):  # type: ignore[no-untyped-def]
-    """Add to every coefficient the values of the points that it acts on, by its weight there."""
+def scatter(layer, nodes, values, squared):  # type: ignore[no-untyped-def]
+    """Add to every coefficient the values of the points that it acts on, by its weight there or,
+    where ``squared``, by that weight's square."""
     height, width = layer.shape[1], layer.shape[2]
     start, steps = np.uintp(layer.ctypes.data), (np.uintp(4 * width), np.uintp(4 * height * width))
     for n in range(len(nodes)):
         x, wx = _weigh(nodes[n, 0])
         y, wy = _weigh(nodes[n, 1])
         z, wz = _weigh(nodes[n, 2])
+        if squared:
+            wx, wy, wz = _squares(wx), _squares(wy), _squares(wz)
         first = start + np.uintp(4 * ((z * height + y) * width + x))
         _add(first, steps, (wx, wy, wz), values[n])
-
-
-@door(*_SOURCES, **_ASKED)
-def scatter_squares(layer, nodes, values):  # type: ignore[no-untyped-def]
-    """The same by the squares of the weights."""
-    height, width = layer.shape[1], layer.shape[2]
-    start, steps = np.uintp(layer.ctypes.data), (np.uintp(4 * width), np.uintp(4 * height * width))
-    for n in range(len(nodes)):
-        x, (a0, a1, a2) = _weigh(nodes[n, 0])
-        y, (b0, b1, b2) = _weigh(nodes[n, 1])
-        z, (c0, c1, c2) = _weigh(nodes[n, 2])
-        first = start + np.uintp(4 * ((z * height + y) * width + x))
-        squares = (
-            (a0 * a0, a1 * a1, a2 * a2),
-            (b0 * b0, b1 * b1, b2 * b2),
-            (c0 * c0, c1 * c1, c2 * c2),
-        )
-        _add(first, steps, squares, values[n])

@@ -25,7 +25,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.field.fit_kernels import gather, mix, room, scatter, scatter_squares, share, touch
+from pipeline.field.fit_kernels import gather, mix, room, scatter, share, touch
 from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
 from pipeline.field.spline import phase_weights, timeline
 from pipeline.field.threads import processors
@@ -333,7 +333,7 @@ class _Fit:
 
         def add(number: int) -> None:
             one, acting = self._moments[number], self._layers.acting
-            scatter(acting, one.nodes, self._weights[number] * self._off[number])
+            scatter(acting, one.nodes, self._weights[number] * self._off[number], squared=False)
             share(slope, one.interval, one.weights, acting, self._shell)
 
         self._for_all(add)
@@ -344,7 +344,7 @@ class _Fit:
 
         def add(number: int) -> None:
             one, acting = self._moments[number], self._layers.acting
-            scatter_squares(acting, one.nodes, self._weights[number])
+            scatter(acting, one.nodes, self._weights[number], squared=True)
             share(diagonal, one.interval, one.weights**2, acting, self._shell)
 
         self._for_all(add)
