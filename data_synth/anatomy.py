@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from data_synth.kernels import Float, Label, Shape, Tubes, compiled
+from data_synth.kernels import Float, Label, Shape, Tubes, asked, inner
 from data_synth.lining import lv_lining, lv_wall, rv_lining
 from data_synth.primitives import (
     box_distance,
@@ -65,7 +65,7 @@ VESSEL_FAT_MM = 3.5
 """Outer edge of wall and fat round a vessel outside the pericardium."""
 
 
-@compiled
+@inner
 def lv_cavity(x: float, y: float, z: float, shape: Shape) -> float:
     """Left-ventricular cavity, closed by the mitral plane."""
     if is_round(shape):
@@ -75,14 +75,14 @@ def lv_cavity(x: float, y: float, z: float, shape: Shape) -> float:
     return smooth_max(bullet(x * x + y * y, value, slope, around), z, 3.0)
 
 
-@compiled
+@inner
 def lv_outside(x: float, y: float, z: float, shape: Shape) -> float:
     """Left-ventricular muscle with its cavity, closed by the mitral plane."""
     value, slope = epicardium(z, shape)
     return smooth_max(bullet(x * x + y * y, value, slope, 0.0), z, 4.0)
 
 
-@compiled
+@inner
 def aorta(x: float, y: float, z: float, pipe: float, tubes: Tubes) -> float:
     """Aortic root with its three sinuses and ascending aorta, from the base plane up.
 
@@ -96,7 +96,7 @@ def aorta(x: float, y: float, z: float, pipe: float, tubes: Tubes) -> float:
     return smooth_max(pipe, 0.3 - z, 2.0)
 
 
-@compiled
+@inner
 def crescent(x: float, y: float, z: float, shape: Shape) -> float:
     """Outside of the right ventricle's body, an outline about the long axis."""
     value, slope = epicardium(z, shape)
@@ -113,7 +113,7 @@ def crescent(x: float, y: float, z: float, shape: Shape) -> float:
     return (r - base - depth * share) / steep
 
 
-@compiled
+@inner
 def rv_cavity(
     x: float, y: float, z: float, shape: Shape, tubes: Tubes, lv: float, pipe: float
 ) -> float:
@@ -127,7 +127,7 @@ def rv_cavity(
     return smooth_max(whole, 0.3 - lv, 4.0)
 
 
-@compiled
+@inner
 def left_atrium(x: float, y: float, z: float, shape: Shape, tubes: Tubes, root: float) -> float:
     """Left atrium with funnel, appendage and vein stubs; ``root`` is the distance to the aorta."""
     dx, dy, dz = x - shape.la_x, y - shape.la_y, z - shape.la_z
@@ -143,7 +143,7 @@ def left_atrium(x: float, y: float, z: float, shape: Shape, tubes: Tubes, root: 
     return smooth_max(whole, VESSEL_WALL_MM + 1 - root, 4.0)
 
 
-@compiled
+@inner
 def right_atrium(
     x: float, y: float, z: float, shape: Shape, root: float, left: float, right: float
 ) -> float:
@@ -164,7 +164,7 @@ def right_atrium(
     return smooth_max(whole, 0.3 - right, 2.0)
 
 
-@compiled
+@inner
 def bodies(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> tuple[float, ...]:
     """Values of (lv cavity, epicardium, rv cavity, left atrium, right atrium, aorta)."""
     inner = lv_cavity(x, y, z, shape)
@@ -176,7 +176,7 @@ def bodies(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> tuple[fl
     return inner, lv, right, left, right_atrium(x, y, z, shape, root, left, right), root
 
 
-@compiled
+@inner
 def whole_heart(values: tuple[float, ...]) -> float:
     """Everything the truth labels name, its clefts of a few millimetres filled."""
     whole = smooth_min(values[1], values[2], 8.0)
@@ -184,7 +184,7 @@ def whole_heart(values: tuple[float, ...]) -> float:
     return smooth_min(whole, values[5], 8.0)
 
 
-@compiled
+@inner
 def vessel_at(x: float, y: float, z: float, trunk: float, tubes: Tubes) -> float:
     """Distance to the nearest vessel that is no body of its own; ``trunk`` is the pulmonary.
 
@@ -201,7 +201,7 @@ def vessel_at(x: float, y: float, z: float, trunk: float, tubes: Tubes) -> float
     return best
 
 
-@compiled
+@inner
 def is_leaflet(x: float, y: float, z: float, shape: Shape) -> bool:
     """Whether a point outside all bodies lies in the closed mitral or tricuspid valve."""
     if -0.5 < z < LEAFLET_MM + 0.5:
@@ -214,7 +214,7 @@ def is_leaflet(x: float, y: float, z: float, shape: Shape) -> bool:
     return False
 
 
-@compiled
+@inner
 def tissue_at(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> int:
     """Tissue at a heart-frame point at the R peak; 0 outside the heart."""
     inner = lv_cavity(x, y, z, shape)
@@ -241,7 +241,7 @@ def tissue_at(x: float, y: float, z: float, shape: Shape, tubes: Tubes) -> int:
     return around_bodies(x, y, z, shape, tubes, (lv, right, left, ra, root))
 
 
-@compiled
+@inner
 def around_bodies(
     x: float, y: float, z: float, shape: Shape, tubes: Tubes, near: tuple[float, ...]
 ) -> int:
@@ -273,7 +273,7 @@ def around_bodies(
     return FAT if min(root, vessel) < VESSEL_FAT_MM else 0
 
 
-@compiled
+@asked
 def label_points(points: Float, shape: Shape, tubes: Tubes) -> Label:
     """Tissue of heart-frame points (n, 3) at the R peak; 0 outside the heart."""
     labels = np.zeros(len(points), np.uint8)
@@ -282,7 +282,7 @@ def label_points(points: Float, shape: Shape, tubes: Tubes) -> Label:
     return labels
 
 
-@compiled
+@asked
 def sample_bodies(x: Float, y: Float, z: Float, shape: Shape, tubes: Tubes) -> Float:
     """Values of the six bodies and the whole heart on a grid: (7, x, y, z)."""
     values = np.empty((7, len(x), len(y), len(z)))

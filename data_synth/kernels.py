@@ -26,8 +26,8 @@ _SOURCES = (
 )
 
 
-def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Compile a numeric function to machine code; the result is kept on disk between runs.
+def asked(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Compile a numeric function that Python calls to machine code, kept on disk between runs.
 
     The compiler looks at a function's own file alone to tell whether its stored code still holds,
     not at those of the functions it calls. So the folder is named by the sources of all.
@@ -35,13 +35,22 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     Calls are compiled into their callers: a call hands over every number of a heart, which costs
     more than most of these functions do.
     """
+    return _compile(function, no_cpython_wrapper=False)
+
+
+def inner(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """The same of a function that only compiled code calls: a way in from Python, which takes a
+    heart's numbers out of their tuple, takes as long to compile as most of these functions do.
+    """
+    return _compile(function, no_cpython_wrapper=True)
+
+
+def _compile(function: Callable[Parameters, Result], **given: bool) -> Callable[Parameters, Result]:
+    options = {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "forceinline": True, **given}
     usual = config.CACHE_DIR
     config.CACHE_DIR = str(Path(usual or _place()) / _digest())
     try:
-        return cast(
-            "Callable[Parameters, Result]",
-            njit(cache=True, nogil=True, no_cfunc_wrapper=True, forceinline=True)(function),
-        )
+        return cast("Callable[Parameters, Result]", njit(**options)(function))
     finally:
         config.CACHE_DIR = usual
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from data_synth.kernels import Shape, Tubes, compiled
+from data_synth.kernels import Shape, Tubes, inner
 from data_synth.primitives import box_distance, smooth_step, tube
 from data_synth.profiles import is_round, scar_share
 from data_synth.tissue import Tissue
@@ -26,7 +26,7 @@ BOX_LEFT, BOX_RIGHT = 9, 11
 """Rows of Tubes.boxes: the first papillary muscle of the left, the moderator band."""
 
 
-@compiled
+@inner
 def ridges(x: float, y: float, z: float, count: float) -> float:
     """Uneven pattern of muscular ridges along the axis that lean, fork and cross: 0 to 1.
 
@@ -40,7 +40,7 @@ def ridges(x: float, y: float, z: float, count: float) -> float:
     return 0.5 + (first + second + 0.8 * third) / 5.6
 
 
-@compiled
+@inner
 def lv_lining(x: float, y: float, z: float, depth: float, shape: Shape, tubes: Tubes) -> int:
     """Tissue ``depth`` mm inside the left cavity."""
     boxes = tubes.boxes
@@ -55,7 +55,7 @@ def lv_lining(x: float, y: float, z: float, depth: float, shape: Shape, tubes: T
     return PAPILLARY_MUSCLE if depth < 1.6 * long * (ridges(x, y, z, 9) - 0.45) else LV_CAVITY
 
 
-@compiled
+@inner
 def rv_lining(x: float, y: float, z: float, depth: float, shape: Shape, tubes: Tubes) -> int:
     """Tissue ``depth`` mm inside the right ventricle."""
     boxes = tubes.boxes
@@ -74,7 +74,7 @@ def rv_lining(x: float, y: float, z: float, depth: float, shape: Shape, tubes: T
     return RV_TRABECULA if depth < 1.6 * long * (ridges(x, y, z, 19) - 0.4) else RV_CAVITY
 
 
-@compiled
+@inner
 def lv_wall(x: float, y: float, z: float, shape: Shape) -> int:
     """Tissue of the left wall: muscle or scar."""
     if is_round(shape):

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_synth.kernels import Float, Shape, compiled
+from data_synth.kernels import Float, Shape, asked, inner
 from data_synth.primitives import smooth_step
 from data_synth.profiles import endocardium, epicardium, rv_depth, rv_share, unevenness
 from data_synth.splines import spline, spline_inverse, spline_slope
@@ -68,14 +68,14 @@ class Beat(NamedTuple):
     infarct_strength: float = 0.0
 
 
-@compiled
+@inner
 def smooth_slope(t: float) -> float:
     """Derivative of :func:`smooth_step`."""
     t = min(max(t, 0.0), 1.0)
     return 30 * t * t * (1 - t) * (1 - t)
 
 
-@compiled
+@inner
 def ramp(x: float) -> tuple[float, float]:
     """max(x, 0) with a rounded corner, twice differentiable; and its slope."""
     t = (x + KINK_MM) / (2 * KINK_MM)
@@ -86,7 +86,7 @@ def ramp(x: float) -> tuple[float, float]:
     return 2 * KINK_MM * t * t * t * (1 - t / 2), t * t * (3 - 2 * t)
 
 
-@compiled
+@inner
 def descent(z: float, shape: Shape) -> tuple[float, float]:
     """Share of the valve plane's way that height z takes part in; and its slope (1/mm)."""
     apex = -shape.lv_length
@@ -98,14 +98,14 @@ def descent(z: float, shape: Shape) -> tuple[float, float]:
     return share, rise * low_slope - (rise + fall) * base_slope + fall * roof_slope
 
 
-@compiled
+@inner
 def drop(x: float, shape: Shape, beat: Beat) -> float:
     """Way of the valve plane (mm) at sideways position x: more on the right of the septum."""
     share = smooth_step((x - shape.lv_radius - shape.lv_wall) / 34)
     return beat.descent_lv + (beat.descent_rv - beat.descent_lv) * share
 
 
-@compiled
+@inner
 def plateau(u: float) -> tuple[float, float]:
     """1 up to |u| = 0.7, one half at 1, 0 from 1.3; and its integral from the middle."""
     size = abs(u)
@@ -114,7 +114,7 @@ def plateau(u: float) -> tuple[float, float]:
     return 1 - smooth_step(t), math.copysign(area, u)
 
 
-@compiled
+@asked
 def infarct_around(angle: float, beat: Beat) -> float:
     """Share of contraction missing at an angle, in the middle of the infarct's height."""
     if beat.infarct_strength == 0.0:
@@ -124,7 +124,7 @@ def infarct_around(angle: float, beat: Beat) -> float:
     return beat.infarct_strength * plateau(offset / beat.infarct_half_angle)[0]
 
 
-@compiled
+@inner
 def infarct_along(z: float, shape: Shape, beat: Beat) -> tuple[float, float]:
     """Share of contraction missing at a height, at the infarct's own angle; and its integral up
     from the apex as a share of the cavity's length.
@@ -138,14 +138,14 @@ def infarct_along(z: float, shape: Shape, beat: Beat) -> tuple[float, float]:
     return share, half * (1.0 - area)
 
 
-@compiled
+@asked
 def infarct_share(z: float, angle: float, shape: Shape, beat: Beat) -> float:
     """Share of contraction missing at a height and angle of the left wall, 0 for healthy muscle."""
     around = infarct_around(angle, beat)
     return around * infarct_along(z, shape, beat)[0] if around > 0 else 0.0
 
 
-@compiled
+@inner
 def sinking(x: float, y: float, z: float, shape: Shape, beat: Beat) -> tuple[float, float]:
     """Way (mm) that a point sinks with the valve plane, and the slope of that way along z.
 
@@ -167,7 +167,7 @@ def sinking(x: float, y: float, z: float, shape: Shape, beat: Beat) -> tuple[flo
     return way * share, way * slope
 
 
-@compiled
+@inner
 def rise(x: float, y: float, z: float, shape: Shape, beat: Beat) -> float:
     """Height from which a point has sunk to z: Newton steps on a slope between 0.6 and 1.3."""
     guess = z + sinking(x, y, z, shape, beat)[0]
@@ -180,7 +180,7 @@ def rise(x: float, y: float, z: float, shape: Shape, beat: Beat) -> float:
     return guess
 
 
-@compiled
+@inner
 def twist(radius2: float, z: float, shape: Shape, beat: Beat) -> float:
     """Angle (radians) by which a ring turns: opposite at apex and base, fading outwards."""
     u = smooth_step(-z / shape.lv_length)
@@ -189,13 +189,13 @@ def twist(radius2: float, z: float, shape: Shape, beat: Beat) -> float:
     return (beat.twist_apex * u + beat.twist_base * (1 - u) * basal) * fade
 
 
-@compiled
+@inner
 def contraction_share(z: float) -> float:
     """1 in the ventricles, 0 in the atria."""
     return 1 - smooth_step((z + 14) / 30)
 
 
-@compiled
+@asked
 def muscle_stretch(z: float, around: float, shape: Shape, beat: Beat) -> float:
     """Length of the left wall along the axis, in its length at the R peak; see infarct_around."""
     slope = descent(z, shape)[1]
@@ -204,27 +204,27 @@ def muscle_stretch(z: float, around: float, shape: Shape, beat: Beat) -> float:
     return 1 - beat.descent_lv * slope
 
 
-@compiled
+@asked
 def muscle_slope(z: float, around: float, shape: Shape, beat: Beat) -> float:
     """Growth of squared radii that keeps the left muscle's volume; 1 well above the valves."""
     return 1 + (1 / muscle_stretch(z, around, shape, beat) - 1) * (1 - smooth_step(z / 14))
 
 
-@compiled
+@inner
 def right_slope(x: float, z: float, shape: Shape, beat: Beat) -> float:
     """The same for the right free wall, at the sideways position to which it has moved."""
     stretch = 1 - drop(x, shape, beat) * descent(z, shape)[1]
     return 1 + (1 / stretch - 1) * (1 - smooth_step(z / 14))
 
 
-@compiled
+@asked
 def contracting(z: float, shape: Shape) -> float:
     """Squared radius (mm^2) of the left cavity as far as it contracts: nil at its closed tip."""
     inner = max(endocardium(z, shape)[0], 0.0)
     return contraction_share(z) * inner**3 / (inner**2 + TIP_MM2**2)
 
 
-@compiled
+@inner
 def radial_knots(
     z: float, angle: float, shape: Shape, beat: Beat, x: Float, y: Float, d: Float
 ) -> None:
@@ -268,7 +268,7 @@ def radial_knots(
     d[0], d[1], d[2], d[3], d[4], d[5] = axis, slope, slope, right, right, 1.0
 
 
-@compiled
+@inner
 def widen(
     p: Float,
     centre: tuple[float, float, float],
@@ -300,7 +300,7 @@ def widen(
     return 1.0 if inverse else spline_slope(q, x, y, d)
 
 
-@compiled
+@inner
 def widen_atria(
     p: Float, shape: Shape, beat: Beat, inverse: bool, knots: tuple[Float, Float, Float]
 ) -> float:
@@ -321,14 +321,14 @@ def widen_atria(
     return slope * widen(p, ra, ra_radii, beat.ra, inverse, knots)
 
 
-@compiled
+@inner
 def turn(p: Float, angle: float) -> None:
     """Turn p about the z axis, in place."""
     c, s = math.cos(angle), math.sin(angle)
     p[0], p[1] = c * p[0] - s * p[1], s * p[0] + c * p[1]
 
 
-@compiled
+@inner
 def carry_point(p: Float, shape: Shape, beat: Beat, x: Float, y: Float, d: Float) -> float:
     """Carry p in place; the Jacobian determinant there. ``x, y, d`` are room for six knots."""
     volume = widen_atria(p, shape, beat, False, (x, y, d))
@@ -345,7 +345,7 @@ def carry_point(p: Float, shape: Shape, beat: Beat, x: Float, y: Float, d: Float
     return volume * (1 - slope)
 
 
-@compiled
+@asked
 def carry_points(points: Float, shape: Shape, beat: Beat) -> Float:
     """Heart-frame points (n, 3) at the R peak -> where they are at the beat's instant."""
     moved = points.copy()
@@ -355,7 +355,7 @@ def carry_points(points: Float, shape: Shape, beat: Beat) -> Float:
     return moved
 
 
-@compiled
+@asked
 def volume_ratios(points: Float, shape: Shape, beat: Beat) -> Float:
     """Jacobian determinant (n,) of :func:`carry_points` at points (n, 3) at the R peak."""
     ratios = np.empty(len(points))
@@ -365,7 +365,7 @@ def volume_ratios(points: Float, shape: Shape, beat: Beat) -> Float:
     return ratios
 
 
-@compiled
+@asked
 def reference_points(points: Float, shape: Shape, beat: Beat) -> Float:
     """Exact inverse of :func:`carry_points`."""
     moved = points.copy()

@@ -9,38 +9,38 @@ from __future__ import annotations
 
 import math
 
-from data_synth.kernels import Float, compiled
+from data_synth.kernels import Float, asked, inner
 
 
-@compiled
+@inner
 def smooth_min(a: float, b: float, k: float) -> float:
     """Union of two bodies, its seam rounded over k mm (polynomial smooth minimum)."""
     h = max(k - abs(a - b), 0.0) / k
     return min(a, b) - h * h * k / 4
 
 
-@compiled
+@inner
 def smooth_max(a: float, b: float, k: float) -> float:
     """Intersection of two bodies, its edge rounded over k mm."""
     h = max(k - abs(a - b), 0.0) / k
     return max(a, b) + h * h * k / 4
 
 
-@compiled
+@asked
 def smooth_step(t: float) -> float:
     """0 below 0, 1 above 1, with two continuous derivatives."""
     t = min(max(t, 0.0), 1.0)
     return t * t * t * (t * (6 * t - 15) + 10)
 
 
-@compiled
+@inner
 def bump(u: float) -> tuple[float, float]:
     """1 at 0, 0 beyond 1 on either side, twice differentiable; and its slope."""
     v = 1 - u * u
     return (v * v * v, -6 * u * v * v) if v > 0 else (0.0, 0.0)
 
 
-@compiled
+@asked
 def tube(x: float, y: float, z: float, line: Float) -> float:
     """Distance to a tube of varying radius: union of tapered capsules along its centre line."""
     best = 1e9
@@ -59,7 +59,7 @@ def tube(x: float, y: float, z: float, line: Float) -> float:
     return best
 
 
-@compiled
+@inner
 def box_distance(x: float, y: float, z: float, box: Float) -> float:
     """Distance to a box given as low and high corner, ``(6,)``; 0 inside."""
     dx = max(box[0] - x, x - box[3], 0.0)
@@ -68,7 +68,7 @@ def box_distance(x: float, y: float, z: float, box: Float) -> float:
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@compiled
+@inner
 def boxed_tube(x: float, y: float, z: float, line: Float, box: Float, reach: float) -> float:
     """Distance to a tube; where its box is farther than ``reach``, the distance to the box.
 
@@ -78,7 +78,7 @@ def boxed_tube(x: float, y: float, z: float, line: Float, box: Float, reach: flo
     return away if away >= reach else tube(x, y, z, line)
 
 
-@compiled
+@inner
 def joined(
     x: float, y: float, z: float, body: float, line: Float, box: Float, k: float, reach: float
 ) -> float:
@@ -93,7 +93,7 @@ def joined(
     return smooth_min(body, away if away >= reach else tube(x, y, z, line), k)
 
 
-@compiled
+@inner
 def ellipsoid(x: float, y: float, z: float, rx: float, ry: float, rz: float) -> float:
     """First-order distance to an ellipsoid about the origin."""
     k0 = math.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
@@ -101,7 +101,7 @@ def ellipsoid(x: float, y: float, z: float, rx: float, ry: float, rz: float) -> 
     return k0 * (k0 - 1) / k1 if k1 > 1e-9 else -min(rx, ry, rz)
 
 
-@compiled
+@inner
 def bullet(s: float, value: float, slope: float, around: float) -> float:
     """First-order distance to the outline s = value(z, angle) of squared radius s.
 
@@ -110,7 +110,7 @@ def bullet(s: float, value: float, slope: float, around: float) -> float:
     return (s - value) / math.sqrt(4 * s + slope * slope + around * around / (s + 4) + 4)
 
 
-@compiled
+@inner
 def rim(x: float, y: float, half_width: float, half_depth: float) -> float:
     """First-order distance to an ellipse about the origin (squarish, as a chest is)."""
     u, v = x / half_width, y / half_depth

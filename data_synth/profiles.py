@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from data_synth.kernels import Shape, compiled
+from data_synth.kernels import Shape, asked, inner
 from data_synth.primitives import bump
 
 FLAT = 0.45
@@ -20,7 +20,7 @@ BULGE_HEIGHT, BULGE_HALF_HEIGHT = 0.35, 0.8
 """Its middle and half its height below the mitral plane, as shares of the cavity's length."""
 
 
-@compiled
+@inner
 def squared_radius(
     z: float, radius: float, widest: float, tip: float, narrowing: float
 ) -> tuple[float, float]:
@@ -42,27 +42,27 @@ def squared_radius(
     return radius * radius * value, radius * radius * slope
 
 
-@compiled
+@asked
 def endocardium(z: float, shape: Shape) -> tuple[float, float]:
     """Squared radius of the left cavity and its slope along z."""
     widest = -shape.lv_widest * shape.lv_length
     return squared_radius(z, shape.lv_radius, widest, -shape.lv_length, shape.lv_narrowing)
 
 
-@compiled
+@asked
 def away_from(angle: float, middle: float) -> float:
     """Angle from ``middle``, between -pi and pi."""
     offset = angle - middle
     return offset - 2 * math.pi * math.floor(offset / (2 * math.pi) + 0.5)
 
 
-@compiled
+@asked
 def is_round(shape: Shape) -> bool:
     """Whether the cavity's outline is the same at every angle."""
     return shape.septal_bulge == 0.0 and shape.scar_thinning == 0.0
 
 
-@compiled
+@inner
 def scar_share(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
     """1 in the middle of the infarct, 0 outside; its slopes along z (1/mm) and by angle."""
     if shape.scar_half_angle <= 0.0:
@@ -73,7 +73,7 @@ def scar_share(z: float, angle: float, shape: Shape) -> tuple[float, float, floa
     return turned * along, turned * by_z / tall, by_angle * along / shape.scar_half_angle
 
 
-@compiled
+@asked
 def unevenness(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
     """Radius of the left cavity over the round one, at an angle about the axis; slopes by z, angle.
 
@@ -93,7 +93,7 @@ def unevenness(z: float, angle: float, shape: Shape) -> tuple[float, float, floa
     return factor, factor_z, outwards * scar_angle - inwards * by_angle * along / BULGE_HALF_ANGLE
 
 
-@compiled
+@asked
 def endocardium_at(z: float, angle: float, shape: Shape) -> tuple[float, float, float]:
     """Squared radius of the left cavity at an angle about the axis; slopes along z, by angle."""
     value, slope = endocardium(z, shape)
@@ -102,7 +102,7 @@ def endocardium_at(z: float, angle: float, shape: Shape) -> tuple[float, float, 
     return value * factor * factor, slope * factor * factor + twice * by_z, twice * by_angle
 
 
-@compiled
+@asked
 def epicardium(z: float, shape: Shape) -> tuple[float, float]:
     """Squared radius of the outside of the left ventricle and its slope along z."""
     widest = -shape.lv_widest * shape.lv_length
@@ -110,7 +110,7 @@ def epicardium(z: float, shape: Shape) -> tuple[float, float]:
     return squared_radius(z, shape.lv_radius + shape.lv_wall, widest, tip, shape.lv_narrowing)
 
 
-@compiled
+@asked
 def rv_depth(z: float, shape: Shape) -> tuple[float, float]:
     """Distance (mm) from septum to free wall in the middle of the right ventricle; its slope.
 
@@ -127,7 +127,7 @@ def rv_depth(z: float, shape: Shape) -> tuple[float, float]:
     return shape.rv_width * value, -shape.rv_width * 0.24 * u / -widest / (1 + t / FLAT) ** 2
 
 
-@compiled
+@asked
 def rv_share(angle: float, shape: Shape) -> tuple[float, float]:
     """Thickness of the crescent at an angle, 1 in its middle, negative outside; its slope."""
     turn = math.pi / (2 * shape.rv_half_angle)

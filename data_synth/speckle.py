@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from data_synth.echo import Optics
-from data_synth.kernels import Float, compiled
+from data_synth.kernels import Float, asked, inner
 from data_synth.sector import Sector
 
 Complex = npt.NDArray[np.complex128]
@@ -47,7 +47,7 @@ def draw_scatterers(rng: np.random.Generator, cell_mm: float) -> Scatterers:
     return Scatterers(cell_mm, np.asarray(real + 1j * imaginary))
 
 
-@compiled
+@inner
 def cell_number(x: float, y: float, z: float) -> int:
     """Number of the cell that holds a point given in cells, well mixed."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
@@ -57,7 +57,7 @@ def cell_number(x: float, y: float, z: float) -> int:
     return int(mixed >> 3) & ((1 << TABLE_BITS) - 1)
 
 
-@compiled
+@asked
 def gather(
     places: Float, beside: Float, across: Float, offsets: Float, weights: Float, echoes: Complex
 ) -> Complex:

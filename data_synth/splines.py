@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-from data_synth.kernels import Float, compiled
+from data_synth.kernels import Float, inner
 
 
-@compiled
+@inner
 def spline(v: float, x: Float, y: Float, d: Float) -> float:
     """Monotone rational-quadratic spline through ``(x, y)`` with slopes ``d``; identity beyond."""
     if v >= x[-1]:
@@ -26,7 +26,7 @@ def spline(v: float, x: Float, y: Float, d: Float) -> float:
     return float(y[k] + rise / (mean + (d[k + 1] + d[k] - 2 * mean) * t * (1 - t)))
 
 
-@compiled
+@inner
 def spline_slope(v: float, x: Float, y: Float, d: Float) -> float:
     """Derivative of :func:`spline`."""
     if v >= x[-1]:
@@ -43,7 +43,7 @@ def spline_slope(v: float, x: Float, y: Float, d: Float) -> float:
     return float(mean * mean * high / (low * low))
 
 
-@compiled
+@inner
 def spline_inverse(w: float, x: Float, y: Float, d: Float) -> float:
     """Exact inverse of :func:`spline`: the root of a quadratic in its stable form."""
     if w >= y[-1]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_synth.kernels import Float, Label, compiled
+from data_synth.kernels import Float, Label, asked, inner
 from data_synth.primitives import ellipsoid, rim, smooth_max, smooth_min, tube
 from data_synth.tissue import Tissue
 
@@ -63,7 +63,7 @@ class Thorax(NamedTuple):
     """Descending aorta."""
 
 
-@compiled
+@inner
 def diaphragm(x: float, y: float, chest: Thorax) -> float:
     """Height of the diaphragm: a right dome, a lower left one, and the middle under the heart."""
     z = chest.diaphragm_z
@@ -73,7 +73,7 @@ def diaphragm(x: float, y: float, chest: Thorax) -> float:
     return -smooth_min(-middle, smooth_min(-right, -left, 12.0), 16.0)
 
 
-@compiled
+@inner
 def stomach(x: float, y: float, z: float, top: float) -> int:
     """Stomach under the left dome, gas in its front as in a patient on the back; or 0."""
     body = ellipsoid(x - 74, y + 6, z - top + 46, 44.0, 46.0, 40.0)
@@ -84,7 +84,7 @@ def stomach(x: float, y: float, z: float, top: float) -> int:
     return GAS if y < -22 else STOMACH
 
 
-@compiled
+@inner
 def belly(x: float, y: float, z: float, outer: float, roof: float, chest: Thorax) -> int:
     """Tissue below the diaphragm, whose height here is ``roof``."""
     under = roof - z
@@ -103,7 +103,7 @@ def belly(x: float, y: float, z: float, outer: float, roof: float, chest: Thorax
     return FAT
 
 
-@compiled
+@inner
 def lung(x: float, y: float, chest: Thorax) -> int:
     """Lungs and the fat between them: narrow before and behind the heart, wide beside it."""
     ahead = (y + 100) / 120
@@ -111,7 +111,7 @@ def lung(x: float, y: float, chest: Thorax) -> int:
     return FAT if abs(x - 8) < min(3.0 + waist, chest.mediastinum) and y < 78 else LUNG
 
 
-@compiled
+@inner
 def cage(y: float, z: float, depth: float, chest: Thorax) -> int:
     """Ribs between muscle: flat bars that slope down to the front; ``depth`` mm into the cage."""
     place = (z - RIB_SLOPE * y) / RIB_PITCH_MM
@@ -120,7 +120,7 @@ def cage(y: float, z: float, depth: float, chest: Thorax) -> int:
     return BONE if tall * tall + deep * deep < 1 else MUSCLE
 
 
-@compiled
+@inner
 def spine(x: float, y: float, z: float) -> int:
     """Vertebral bodies with discs between them, canal, arch and spines; 0 elsewhere."""
     body = (x / 19) ** 2 + ((y - SPINE_Y_MM) / 15) ** 2
@@ -139,7 +139,7 @@ def spine(x: float, y: float, z: float) -> int:
     return 0
 
 
-@compiled
+@inner
 def sternum(x: float, y: float, z: float, chest: Thorax) -> bool:
     """Breast bone: a plate behind the skin, above the diaphragm."""
     depth = y + chest.half_depth - chest.skin_fat
@@ -149,7 +149,7 @@ def sternum(x: float, y: float, z: float, chest: Thorax) -> bool:
     return flat * flat + ((depth - 9) / 6.0) ** 2 < 1
 
 
-@compiled
+@inner
 def middle_parts(x: float, y: float, z: float, chest: Thorax) -> int:
     """Aorta with its arch, lower cava, gullet and spine; 0 elsewhere."""
     if abs(x) > 60 or y < -30:
@@ -172,13 +172,13 @@ def middle_parts(x: float, y: float, z: float, chest: Thorax) -> int:
     return 0
 
 
-@compiled
+@inner
 def back_muscle(x: float, y: float, outer: float) -> bool:
     """The long muscles on both sides of the spine."""
     return y > 62 and smooth_max(abs(abs(x) - 34) - 22, -48 - outer, 8.0) < 0
 
 
-@compiled
+@inner
 def chest_at(x: float, y: float, z: float, chest: Thorax) -> int:
     """Tissue of the chest at one LPS point about the middle of the body."""
     outer = rim(x, y, chest.half_width, chest.half_depth)
@@ -202,7 +202,7 @@ def chest_at(x: float, y: float, z: float, chest: Thorax) -> int:
     return belly(x, y, z, outer, roof, chest) if z < roof else lung(x, y, chest)
 
 
-@compiled
+@asked
 def chest_points(points: Float, chest: Thorax) -> Label:
     """Tissue of LPS points (n, 3) about the middle of the body, with no heart in it."""
     labels = np.zeros(len(points), np.uint8)
