@@ -20,7 +20,7 @@ from pipeline.registration import compiled as clock
 @pytest.mark.parametrize(
     ("door", "marks"),
     [
-        (phantom, ("compiled",)),
+        (phantom, ("asked", "inner")),
         (clock, ("asked", "inner", "within")),
         (field, ("asked", "inner")),
         (dissection, ("asked", "inner")),
