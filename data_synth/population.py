@@ -35,6 +35,7 @@ sex (1.95 and 1.71 m2) and the atria's emptying of 51 and 44 % are chosen, not p
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -188,6 +189,7 @@ def _draw_outlines(draws: _Draws, person: Person) -> Shape:
     return mean._replace(**drawn)
 
 
+@lru_cache(maxsize=16)
 def fit_shape(shape: Shape, person: Person) -> Shape:
     """Solve for the radii, walls and widths that give a person's volumes, within a percent.
 

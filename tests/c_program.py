@@ -7,10 +7,11 @@ from pathlib import Path
 from pipeline.field import get_include
 
 HERE = Path(__file__).parent
-SANITIZE = ["-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SANITIZE = ["-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 """Options for a program that ends at the first wrong access or undefined behaviour.
 
-``-g1`` names the lines of a trace; to know where each variable is would take a second to compile.
+``-g1`` names the lines of a trace; to know where each variable is would take a second to compile,
+and ``-O2`` two.
 """
 
 

@@ -1,5 +1,7 @@
 """Settings that all tests share."""
 
+import gc
+
 import pytest
 from hypothesis import settings
 
@@ -35,3 +37,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first: workers take whole files in turn, and short ones even out the end."""
     rank = {name: place for place, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays, and need not be looked through for garbage time and again."""
+    gc.freeze()
