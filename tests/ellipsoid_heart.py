@@ -7,6 +7,7 @@ phase, with other grey values, gain and speckle than registration assumes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pyvista as pv
@@ -112,8 +113,12 @@ def draw_frame(
     return (np.clip(grey, 1, 255).round() * sector).astype(np.float32)
 
 
+@cache
 def record(seed: int, frames: int = 14) -> Recording:
-    """An apical and a parasternal fan of 1 mm pixels, each swung through 50 degrees."""
+    """An apical and a parasternal fan of 1 mm pixels, each swung through 50 degrees.
+
+    Tests share it: whoever changes an array makes a copy.
+    """
     rng = np.random.default_rng(seed)
     mr_from_tracker = random_motion(rng, 200, 120)
     views = [([5, -5, -75], [-0.1, 0.1, 1]), ([10, -90, -5], [-0.15, 1, 0.15])]

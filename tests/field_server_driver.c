@@ -126,7 +126,7 @@ int main(int count, char **words)
         printf("%d\n", j.bad);
     } else if (!strcmp(command, "often")) {
         int n;
-        for (n = 0; n < 60 && status == BF_OK; n++) {
+        for (n = 0; n < 24 && status == BF_OK; n++) {
             bf_close(&field);
             status = n % 2 ? bf_verify(words[1]) : BF_OK;
             if (status == BF_OK) status = bf_open(&field, words[1]);

@@ -29,6 +29,7 @@ RR_S = 0.8
 R_TIMES_S = 0.3 + RR_S * np.arange(12)
 SETTINGS = RegisterSettings(grid_mm=3.0, sample_spacing_mm=5.0)
 QUICK = SETTINGS.model_copy(update={"candidates": 80, "starts": 2, "max_frames": 40})
+FROM_THERE = QUICK.model_copy(update={"candidates": 1, "starts": 1})
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,12 @@ def recording():
     return record(seed=2, frames=16)
 
 
+@pytest.fixture(scope="module")
+def drawn(recording, surfaces):
+    """The model, drawn once for all searches of these surfaces."""
+    return prepare_search(recording.phases, surfaces, recording.mr_from_tracker, SETTINGS)
+
+
 def stamped(recording, late_s=0.0):
     """Times of frames of a regular heart, ``late_s`` ahead of the ECG's clock: frames follow one
     another by 0.11 of a beat, the second sweep begins some beats after the first."""
@@ -51,10 +58,10 @@ def stamped(recording, late_s=0.0):
     return Timing(sweeps, R_TIMES_S, RR_S)
 
 
-def estimated(recording, surfaces, timing, shift_mm=0.0):
+def estimated(recording, drawn, timing, shift_mm=0.0):
     """The offset, from the pose that fits best at the phases of the stamps as they are."""
     start = start_off(recording, 3, shift_mm, shift_mm)
-    search = prepare_search(timing.phases(), surfaces, start, SETTINGS)
+    search = replace(drawn, phases=timing.phases(), start=start)
     level = search.fine_level(recording.sweeps)
     pose = climb(level, start, search.pivot)
     return estimate_offset(level, pose, search.pivot, timing)
@@ -66,23 +73,23 @@ def test_stamps_give_the_phases_they_were_made_from(recording):
 
 
 @pytest.mark.parametrize("late_s", [-0.17, 0.0, 0.12])
-def test_the_offset_is_found_with_its_error(recording, surfaces, late_s):
-    found = estimated(recording, surfaces, stamped(recording, late_s), shift_mm=3.0)
+def test_the_offset_is_found_with_its_error(recording, drawn, late_s):
+    found = estimated(recording, drawn, stamped(recording, late_s), shift_mm=3.0)
     # The project's own requirement; and four standard deviations, which one in 16000 passes.
     assert abs(found.offset_s - late_s) < 0.010
     assert abs(found.offset_s - late_s) < 4 * found.sd_s
     assert found.significant == (late_s != 0.0)
 
 
-def test_a_pose_drawn_by_a_wrong_offset_is_put_right(recording, surfaces):
+def test_a_pose_drawn_by_a_wrong_offset_is_put_right(recording, drawn):
     timing = stamped(recording, 0.15)
-    search = prepare_search(timing.phases(), surfaces, recording.mr_from_tracker, SETTINGS)
+    search = replace(drawn, phases=timing.phases())
     level = search.fine_level(recording.sweeps)
-    drawn = climb(level, recording.mr_from_tracker, search.pivot)
-    found = estimate_offset(level, drawn, search.pivot, timing)
+    wrong = climb(level, recording.mr_from_tracker, search.pivot)
+    found = estimate_offset(level, wrong, search.pivot, timing)
     before, after = (
         search.pivot.distance(pose, recording.mr_from_tracker)
-        for pose in (drawn, found.mr_from_tracker)
+        for pose in (wrong, found.mr_from_tracker)
     )
     assert max(after) < max(before)
     # Frames' speckle moves the pose of exact surfaces by some tenths of a millimetre.
@@ -96,22 +103,23 @@ def test_frames_of_a_heart_that_stands_still_tell_no_offset(surfaces):
         for name, s in surfaces.items()
     }
     recording = record(seed=4)
-    found = estimated(recording, still, stamped(recording))
+    drawn = prepare_search(recording.phases, still, recording.mr_from_tracker, SETTINGS)
+    found = estimated(recording, drawn, stamped(recording))
     assert found.offset_s is None
     assert found.sd_s == np.inf
 
 
-def test_few_frames_tell_no_offset(surfaces):
+def test_few_frames_tell_no_offset(drawn):
     recording = record(seed=5, frames=9)
-    assert estimated(recording, surfaces, stamped(recording)).offset_s is None
+    assert estimated(recording, drawn, stamped(recording)).offset_s is None
 
 
-def test_frames_at_the_ends_of_the_ecg_do_not_stop_the_search(recording, surfaces):
+def test_frames_at_the_ends_of_the_ecg_do_not_stop_the_search(recording, drawn):
     timing = stamped(recording, 0.1)
     # The last R peak that is known is the one before the last frames.
     last_s = timing.times_s[1][-1]
     timing = replace(timing, r_times_s=R_TIMES_S[last_s > R_TIMES_S])
-    found = estimated(recording, surfaces, timing)
+    found = estimated(recording, drawn, timing)
     assert abs(found.offset_s - 0.1) < 0.010
 
 
@@ -129,16 +137,16 @@ def test_an_offset_may_put_frames_more_than_a_beat_outside_the_ecg():
         replace(timing, times_s=[times_s - 0.2]).phases(0.3)
 
 
-def settled(recording, surfaces, timing, choice):
+def settled(recording, drawn, timing, choice):
     """What a search finds at the phases of the stamps as they are, and after settling."""
     start = start_off(recording, 3, 8, 8)
-    search = prepare_search(timing.phases(), surfaces, start, QUICK)
+    search = replace(drawn, phases=timing.phases(), start=start, settings=QUICK)
     best = search.best(recording.sweeps)
     return search, best, settle_clock(search, best, recording.sweeps, timing, choice)
 
 
-def test_an_offset_beyond_doubt_is_taken_off_the_phases(recording, surfaces):
-    search, best, found = settled(recording, surfaces, stamped(recording, 0.15), "apply")
+def test_an_offset_beyond_doubt_is_taken_off_the_phases(recording, drawn):
+    search, best, found = settled(recording, drawn, stamped(recording, 0.15), "apply")
     assert abs(found.clock.applied_s - 0.15) < 0.010
     assert found.best.score > best.score
     for own, true in zip(found.search.phases, recording.phases, strict=True):
@@ -151,34 +159,34 @@ def test_an_offset_beyond_doubt_is_taken_off_the_phases(recording, surfaces):
     assert after < before
 
 
-def test_an_offset_that_is_only_measured_changes_nothing(recording, surfaces):
-    search, best, found = settled(recording, surfaces, stamped(recording, -0.1), "measure")
+def test_an_offset_that_is_only_measured_changes_nothing(recording, drawn):
+    search, best, found = settled(recording, drawn, stamped(recording, -0.1), "measure")
     assert abs(found.clock.offset_s + 0.1) < 0.010
     assert found.clock.applied_s == 0.0
     assert found.search is search
     assert found.best is best
 
 
-def test_clocks_that_agree_are_left_alone(recording, surfaces):
-    search, _, found = settled(recording, surfaces, stamped(recording), "apply")
+def test_clocks_that_agree_are_left_alone(recording, drawn):
+    search, _, found = settled(recording, drawn, stamped(recording), "apply")
     assert abs(found.clock.offset_s) < 0.010
     assert found.clock.applied_s == 0.0
     assert found.search is search
 
 
-def test_an_offset_that_is_ignored_is_not_looked_at(recording, surfaces):
-    search = prepare_search(recording.phases, surfaces, recording.mr_from_tracker, QUICK)
+def test_an_offset_that_is_ignored_is_not_looked_at(recording, drawn):
+    search = replace(drawn, settings=QUICK)
     best = Best(recording.mr_from_tracker, 1.0, 0.0)
     timing = stamped(recording, 0.1)
     assert settle_clock(search, best, recording.sweeps, timing, "ignore").clock is None
     assert settle_clock(search, best, recording.sweeps, None, "apply").clock is None
 
 
-def test_r_times_in_doubt_give_no_offset(recording, surfaces):
+def test_r_times_in_doubt_give_no_offset(recording, drawn):
     """A record told at half its sampling rate: beats twice as long as the cine's, by which the
     phases are wrong whatever the offset, though some offset fits best."""
     timing = replace(stamped(recording, 0.1), cycle_rr_s=RR_S / 2)
-    search, best, found = settled(recording, surfaces, timing, "apply")
+    search, best, found = settled(recording, drawn, timing, "apply")
     assert len(timing.doubts()) == 1
     assert found.clock.offset_s is None
     assert found.clock.applied_s == 0.0
@@ -189,9 +197,9 @@ def test_r_times_in_doubt_give_no_offset(recording, surfaces):
 
 @pytest.fixture(scope="module")
 def truly(recording, surfaces):
-    """What is found at the true phases."""
-    start = start_off(recording, 3, 8, 8)
-    return find(recording.sweeps, recording.phases, surfaces, start, QUICK)
+    """What is found at the true phases, from the true pose."""
+    given = recording.sweeps, recording.phases, surfaces, recording.mr_from_tracker
+    return find(*given, FROM_THERE)
 
 
 @pytest.mark.parametrize("choice", ["apply", pytest.param("ignore", marks=pytest.mark.slow)])
@@ -215,12 +223,12 @@ def test_an_offset_counts_from_three_standard_deviations_on():
 
 
 @pytest.mark.parametrize(("sd_s", "known"), [(0.019, True), (0.0199, False)])
-def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, surfaces, sd_s, known):
+def test_an_offset_less_sure_than_20_ms_is_none(monkeypatch, recording, drawn, sd_s, known):
     """The model's own 5 ms counted in."""
     monkeypatch.setattr(_Profile, "nearest", lambda self, pose, offset_s: (0.1, pose))
     monkeypatch.setattr(_Profile, "summit", lambda self, poses, offset_s: (0.1, sd_s))
     monkeypatch.setattr(_Profile, "climb", lambda self, pose, offset_s: pose)
-    found = estimated(recording, surfaces, stamped(recording))
+    found = estimated(recording, drawn, stamped(recording))
     assert (found.offset_s is not None) == known
     assert found.sd_s == (pytest.approx(np.hypot(sd_s, 0.005)) if known else np.inf)
 
@@ -281,11 +289,11 @@ def later_by(timing, late_s):
 
 
 @pytest.mark.parametrize("late_s", [-0.3, 0.0, 0.03, 0.12, 0.35])
-def test_sweeps_on_two_clocks_are_told_apart(long_recording, surfaces, late_s):
+def test_sweeps_on_two_clocks_are_told_apart(long_recording, drawn, late_s):
     """At the pose that fits best by the stamps as they are, right or wrong."""
     timing = later_by(stamped(long_recording), late_s)
     start = long_recording.mr_from_tracker
-    search = prepare_search(timing.phases(), surfaces, start, SETTINGS)
+    search = replace(drawn, phases=timing.phases(), start=start)
     level = search.fine_level(long_recording.sweeps)
     found = clocks_apart(level, climb(level, start, search.pivot), search.pivot, timing)
     if abs(late_s) < 0.05:
@@ -300,7 +308,7 @@ def test_sweeps_on_two_clocks_are_told_apart(long_recording, surfaces, late_s):
 def test_clocks_that_are_apart_make_a_result_doubtful(long_recording, surfaces):
     timing = later_by(stamped(long_recording), 0.2)
     given = long_recording.sweeps, timing.phases(), surfaces, long_recording.mr_from_tracker
-    found = find(*given, QUICK, timing=timing)
+    found = find(*given, FROM_THERE, timing=timing)
     assert found.verdict != "good"
     assert re.search(r"stamps of sweep 2 are 0\.(19|20|21) s ahead of .* sweep 1", found.reason)
 

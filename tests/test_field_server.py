@@ -55,7 +55,7 @@ def described(path, target, **changes):
 
 
 def test_opening_and_verifying_often_leaves_no_file_open(path, program):
-    limited = run("/bin/sh", "-c", f"ulimit -n 40; exec {program} {path} often")
+    limited = run("/bin/sh", "-c", f"ulimit -n 16; exec {program} {path} often")
     assert limited.stdout == b"done\n"
 
 
@@ -318,6 +318,51 @@ def test_other_declarations_are_left_to_the_program(tmp_path, standard):
         "int main(void) { return usleep(0) || M_PI < 3; }\n"
     )
     build(source, tmp_path / "own", f"-std={standard}")
+
+
+UNLOCKED = """
+#define _GNU_SOURCE
+#define BEATFIELD_IMPLEMENTATION
+#include "beatfield.h"
+#include <malloc.h>
+
+/* Parts of the heap that may be paged out. */
+static int unlocked(void)
+{
+    FILE *maps = fopen("/proc/self/smaps", "r");
+    char line[1024];
+    int heap = 0, count = 0;
+    while (maps && fgets(line, sizeof line, maps)) {
+        if (strstr(line, "[heap]")) heap = 1;
+        if (strncmp(line, "VmFlags:", 8) != 0) continue;
+        count += heap && !strstr(line, " lo");
+        heap = 0;
+    }
+    if (maps) fclose(maps);
+    return count;
+}
+
+int main(int count, char **words)
+{
+    bf_field field;
+    if (count < 2 || !mallopt(M_MMAP_MAX, 0) || !mallopt(M_TRIM_THRESHOLD, -1)) return 1;
+    if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) return 77;
+    if (bf_open(&field, words[1]) != BF_OK || bf_lock(&field) != BF_OK) return 77;
+    bf_close(&field);
+    printf("%d\\n", unlocked());
+    return 0;
+}
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
+def test_what_the_program_has_locked_stays_locked_when_a_field_is_closed(path, tmp_path):
+    (tmp_path / "own.c").write_text(UNLOCKED)
+    program = build(tmp_path / "own.c", tmp_path / "own", "-std=gnu99", "-O0")
+    done = run(program, path)
+    if done.returncode == 77:
+        pytest.skip("not allowed to lock memory")
+    assert (done.returncode, done.stdout) == (0, b"0\n")
 
 
 @pytest.mark.parametrize("phase", [1e17, 1e19, -1e19, 1e300])

@@ -41,18 +41,22 @@ def found_with(recording, factors):
     return find(recording.sweeps, recording.phases, stretched(factors), start, QUICK)
 
 
-def test_a_heart_of_its_own_size_is_not_in_doubt(recording):
-    found = found_with(recording, [1, 1, 1])
-    assert not found.size.in_doubt
-    assert found.size.error_mm == 0
-    assert "better with a heart" not in found.reason
+@pytest.fixture(scope="module")
+def right(recording):
+    return found_with(recording, [1, 1, 1])
+
+
+def test_a_heart_of_its_own_size_is_not_in_doubt(right):
+    assert not right.size.in_doubt
+    assert right.size.error_mm == 0
+    assert "better with a heart" not in right.reason
 
 
 @pytest.mark.parametrize(
     ("factor", "way"), [(0.93, "larger"), pytest.param(1.08, "smaller", marks=pytest.mark.slow)]
 )
-def test_a_wrong_size_is_in_doubt_and_expected_as_an_error(recording, factor, way):
-    right, wrong = found_with(recording, [1, 1, 1]), found_with(recording, [factor] * 3)
+def test_a_wrong_size_is_in_doubt_and_expected_as_an_error(recording, right, factor, way):
+    wrong = found_with(recording, [factor] * 3)
     assert wrong.size.in_doubt
     # In steps of 4 %, of which the nearest is meant.
     assert (1 + wrong.size.larger) * factor == pytest.approx(1, abs=0.035)

@@ -304,9 +304,9 @@ class TestRefusals:
         job = a_job(RegisterSettings(), mirror_image)
         told = stage._registered(job, [], timing, {}, None)
         assert bool(told) == mirror_image
-        start = start_off(recording, 100, 8, 8)
-        given = recording.sweeps, recording.phases, moving_surfaces(), start
-        result = register(*given, QUICK, doubts=told)
+        given = recording.sweeps, recording.phases, moving_surfaces(), recording.mr_from_tracker
+        from_there = QUICK.model_copy(update={"candidates": 1, "starts": 1})
+        result = register(*given, from_there, doubts=told)
         assert (result.verdict == "good") != mirror_image
         assert ("a mirror image" in result.reason) == mirror_image
 

@@ -244,6 +244,16 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #ifndef O_DIRECTORY
 #error "include beatfield.h before other headers where it is implemented, or define _POSIX_C_SOURCE 200809L"
 #endif
+/* Memory of no file, in whole pages; POSIX before 2024 does not tell its name. */
+#if defined(MAP_ANONYMOUS)
+#define BF__ANONYMOUS MAP_ANONYMOUS
+#elif defined(MAP_ANON)
+#define BF__ANONYMOUS MAP_ANON
+#elif defined(__linux__)
+#define BF__ANONYMOUS 0x20
+#else
+#define BF__ANONYMOUS 0x1000
+#endif
 #endif
 /* Where the compiler can make code for a processor that it only may meet, four nodes of a row are
  * read at a time if the processor can; BEATFIELD_PLAIN leaves that out. */
@@ -1108,18 +1118,15 @@ static bf_status bf__map(const bf__folder *folder, const char *name, size_t byte
 #endif
 }
 
-static void bf__unmap(const float *values, size_t bytes, int copied)
+static void bf__unmap(const float *values, size_t bytes)
 {
     void *start = (void *)(uintptr_t)values;
     if (!values) return;
 #ifdef _WIN32
-    (void)bytes, (void)copied;
+    (void)bytes;
     free(start);
 #else
-    if (copied) {
-        munlock(start, bytes);
-        free(start);
-    } else munmap(start, bytes);
+    munmap(start, bytes);
 #endif
 }
 
@@ -1172,7 +1179,8 @@ bf_status bf_open(bf_field *field, const char *path)
 }
 
 #ifndef _WIN32
-/* Copies in the place of mapped files; all, or none. */
+/* Copies in the place of mapped files; all, or none. Not of malloc: to unlock pages of its heap would
+ * take from the program what mlockall has locked. */
 static bf_status bf__copy(bf_field *field)
 {
     size_t count = (size_t)field->structures * (size_t)field->phases, at;
@@ -1180,18 +1188,20 @@ static bf_status bf__copy(bf_field *field)
     if (!copies) return BF_NO_MEMORY;
     for (at = 0; at < count; at++) {
         const bf_structure_part *part = &field->structure[at / (size_t)field->phases];
-        if (posix_memalign(&copies[at], 4096, field->bytes) != 0) break;
+        const int own = MAP_PRIVATE | BF__ANONYMOUS;
+        copies[at] = mmap(NULL, field->bytes, PROT_READ | PROT_WRITE, own, -1, 0);
+        if (copies[at] == MAP_FAILED) break;
         memcpy(copies[at], part->coefficients[at % (size_t)field->phases], field->bytes);
     }
     if (at < count) {
-        while (at--) free(copies[at]);
+        while (at--) munmap(copies[at], field->bytes);
         free(copies);
         return BF_NO_MEMORY;
     }
     for (at = 0; at < count; at++) {
         const bf_structure_part *part = &field->structure[at / (size_t)field->phases];
         const float **values = &part->coefficients[at % (size_t)field->phases];
-        bf__unmap(*values, field->bytes, 0);
+        bf__unmap(*values, field->bytes);
         *values = (const float *)copies[at];
     }
     free(copies);
@@ -1235,7 +1245,7 @@ void bf_close(bf_field *field)
     int n, k;
     for (n = 0; field->structure && n < field->structures; n++) {
         for (k = 0; field->structure[n].coefficients && k < field->phases; k++)
-            bf__unmap(field->structure[n].coefficients[k], field->bytes, field->copied);
+            bf__unmap(field->structure[n].coefficients[k], field->bytes);
         free((void *)field->structure[n].coefficients);
     }
     free(field->structure);
