@@ -326,20 +326,21 @@ UNLOCKED = """
 #include "beatfield.h"
 #include <malloc.h>
 
-/* Parts of the heap that may be paged out. */
+/* Parts of the heap that may be paged out, -1 where no heap is told of. */
 static int unlocked(void)
 {
     FILE *maps = fopen("/proc/self/smaps", "r");
     char line[1024];
-    int heap = 0, count = 0;
+    int heap = 0, heaps = 0, count = 0;
     while (maps && fgets(line, sizeof line, maps)) {
         if (strstr(line, "[heap]")) heap = 1;
         if (strncmp(line, "VmFlags:", 8) != 0) continue;
         count += heap && !strstr(line, " lo");
+        heaps += heap;
         heap = 0;
     }
     if (maps) fclose(maps);
-    return count;
+    return heaps ? count : -1;
 }
 
 int main(int count, char **words)
