@@ -124,6 +124,60 @@ def test_a_small_beat_that_a_tug_follows_is_kept():
     assert lost.sum() <= 1
 
 
+def echo(at_s, size):
+    """A sharp wave after a beat, as blood in a scanner's field makes when its flow turns."""
+    return ((at_s, 0.011, -size, 0.3 * size),)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "size", "rr_s"),
+    [(0.34, 0.9, 1.0), (0.38, 0.9, 0.75), (0.38, 0.75, 0.85), (0.42, 0.75, 0.75), (0.45, 0.9, 1.0)],
+)
+def test_a_sharp_wave_that_follows_every_beat_is_its_echo(at_s, size, rr_s):
+    rng = np.random.default_rng(3)
+    times_s, r_s = np.arange(60 * 360) / 360, 0.4 + np.cumsum(rng.normal(rr_s, 0.02, 90))
+    r_s = r_s[r_s < 59.4]
+    signal = draw(rng, times_s, [(at, (*NORMAL, *echo(at_s, size))) for at in r_s])
+    found_s = np.array([one.time_s for one in find_beats(signal, 360.0)])
+    assert (matched(found_s, r_s) >= 0).all()
+    # Four that were told teach it; where they change levels before they do, as many again.
+    assert len(found_s) - len(r_s) <= 8
+    assert (found_s > 15.0).sum() == (r_s > 15.0).sum()
+
+
+def test_what_came_at_the_time_of_an_echo_is_a_beat_again_once_there_are_none():
+    """The patient has left the bore; early beats come as late as echoes did, and no larger."""
+    rng = np.random.default_rng(3)
+    times_s, r_s = np.arange(130 * 360) / 360, 0.4 + np.arange(150) * 0.85
+    early = [at + 0.38 for k, at in enumerate(r_s) if k > 90 and k % 8 == 0]
+    waves = [(*NORMAL, *echo(0.38, 0.9)) if k < 30 else NORMAL for k in range(len(r_s))]
+    beats = [*zip(r_s, waves, strict=True), *((at, scaled(QRS, 0.5)) for at in early)]
+    found_s = np.array([one.time_s for one in find_beats(draw(rng, times_s, sorted(beats)), 360.0)])
+    assert (matched(found_s, np.array(early)) >= 0).all()
+
+
+LOW_WIDE: Waves = ((0.0, 0.018, -0.60, 0.54), (0.27, 0.050, 0.25, -0.20))
+LOW_NARROW: Waves = ((0.0, 0.012, -0.75, 0.50), (0.27, 0.050, 0.25, -0.20))
+
+
+@pytest.mark.parametrize(
+    ("other", "pair_s", "coupling_s"),
+    [
+        # Of the atria: as early and as sharp, but like the others.
+        *((scaled((*QRS, *T), 0.7), *times) for times in ((0.8, 0.26), (1.0, 0.38), (1.15, 0.44))),
+        # Of a ventricle: broad, or with a pause behind them.
+        (LOW_WIDE, 1.0, 0.44),
+        (LOW_NARROW, 1.6, 0.44),
+    ],
+)
+def test_low_beats_in_turn_with_the_hearts_own_are_no_echoes(other, pair_s, coupling_s):
+    rng = np.random.default_rng(3)
+    times_s, r_s = np.arange(60 * 360) / 360, np.arange(0.4, 59.0, pair_s)
+    beats = [one for at in r_s for one in ((at, NORMAL), (at + coupling_s, other))]
+    found_s = np.array([one.time_s for one in find_beats(draw(rng, times_s, beats), 360.0)])
+    assert (matched(found_s, np.array([at for at, _ in beats])) >= 0).all()
+
+
 FAST: Waves = ((-0.15, 0.018, 0.10, 0.0), (0.0, 0.012, 1.0, 0.0))
 
 

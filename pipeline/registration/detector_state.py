@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.geometry import Float
 
-KEPT_INTERVALS, KEPT_WAVES, KEPT_FOUND = 8, 64, 64
+KEPT_INTERVALS, KEPT_BEATS, KEPT_WAVES, KEPT_FOUND = 8, 9, 64, 64
 SHAPE_POINTS = 21
 """Places about R at which shapes are compared."""
 T_STEPS, T_STEP_S = 24, 0.02
@@ -130,6 +130,19 @@ class Rhythm:
     interval: Annotated[Float, KEPT_INTERVALS]
     usual_rr: float
     """Their mean."""
+    at: Annotated[Float, KEPT_BEATS]
+    """Times, energies, heights over steepness, and likenesses of the latest beats: a ring."""
+    height: Annotated[Float, KEPT_BEATS]
+    breadth: Annotated[Float, KEPT_BEATS]
+    alike: Annotated[Float, KEPT_BEATS]
+    echo_s: float
+    """How long after a beat an echo of it comes; 0 where there is none."""
+    echo_height: float
+    """Its energy, as a share of the beat's."""
+    echo_share: float
+    """How often, of late, one came."""
+    echoed: bool
+    """Whether one came after the last beat."""
 
 
 class Now:
