@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -345,3 +350,27 @@ def test_a_rate_told_by_rounded_times_is_no_other(rate_hz):
 def test_another_number_of_leads_is_refused():
     with pytest.raises(InputError, match=r"needs \(n, 2\)"):
         RPeakDetector(250.0, 2).push([1.0, 2.0, 3.0])
+
+
+CHECKED = """
+from arrhythmia_records import record
+from pipeline.registration.rpeaks import find_beats
+
+for case, first_s, last_s in (("bursts", 15, 22), ("fibrillation", 20, 30), ("normal", 0, 9)):
+    drawn = record(case, 0, duration_s=40.0)
+    silent = slice(int(first_s * drawn.rate_hz), int(last_s * drawn.rate_hz))
+    drawn.signal_mv[silent] = 0.0
+    assert len(find_beats(drawn.signal_mv, drawn.rate_hz)) > 10
+"""
+
+
+@pytest.mark.slow
+def test_nothing_is_read_beside_an_array_when_all_leads_show_nothing(tmp_path):
+    """What lies there differs from run to run, and so would the beats after the silence."""
+    root = Path(__file__).parent.parent
+    asked = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = os.environ | asked | {"PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}"}
+    done = subprocess.run(
+        [sys.executable, "-c", CHECKED], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

@@ -178,6 +178,22 @@ def test_low_beats_in_turn_with_the_hearts_own_are_no_echoes(other, pair_s, coup
     assert (matched(found_s, np.array([at for at, _ in beats])) >= 0).all()
 
 
+@pytest.mark.parametrize(
+    ("other", "pair_s", "coupling_s"), [(scaled(NORMAL, 0.6), 0.8, 0.38), (LOW_NARROW, 1.7, 0.42)]
+)
+def test_beats_at_the_time_of_echoes_are_found_after_these_have_ended(other, pair_s, coupling_s):
+    """The patient has left the bore with beats in turn: as alike as usual, or with a pause."""
+    rng = np.random.default_rng(3)
+    times_s, inside_s = np.arange(120 * 360) / 360, 0.4 + np.arange(30) * 0.85
+    after_s = np.arange(27.0, 119.0, pair_s)
+    beats = [(at, (*NORMAL, *echo(0.38, 0.9))) for at in inside_s]
+    beats += [one for at in after_s for one in ((at, NORMAL), (at + coupling_s, other))]
+    found_s = np.array([one.time_s for one in find_beats(draw(rng, times_s, beats), 360.0)])
+    # With a pause they are known once thirty beats have had none.
+    true_s = np.array([at for at, _ in beats if at > (80.0 if other is LOW_NARROW else 32.0)])
+    assert (matched(found_s, true_s) < 0).sum() <= 1
+
+
 FAST: Waves = ((-0.15, 0.018, 0.10, 0.0), (0.0, 0.012, 1.0, 0.0))
 
 

@@ -376,6 +376,23 @@ def test_a_file_is_mirrored_by_a_seventh_less_doubt(share, mirrored):
     assert found.mirrored == mirrored
 
 
+@pytest.mark.parametrize("turn_deg", [0, 90])
+@pytest.mark.parametrize(
+    ("small_end", "share", "exchanged"), [(-1, 0.83, True), (-1, 0.87, False), (0, 0.5, False)]
+)
+def test_base_and_apex_of_a_short_stack_are_told_by_doubt(small_end, share, exchanged, turn_deg):
+    """Cuts of one size but for the file's last slice, or its first one, which is half of it."""
+
+    def look(tried):
+        axes = tried.applied(Orientation(turn_deg).applied(np.eye(3)))
+        axes[2, 2] = 0.0
+        labels = drawn_heart(axes)
+        labels[-1 if (small_end == -1) != tried.upside_down else 0, :32] = 0
+        return labels, 1000.0 * (share if tried.upside_down else 1.0) * (1 + tried.mirrored)
+
+    assert find_orientation(look).upside_down == exchanged
+
+
 @pytest.mark.parametrize(("share", "believed"), [(1.08, False), (1.13, True)])
 def test_a_file_is_believed_where_any_other_way_is_more_doubtful(share, believed):
     look = looking_at(Orientation(180))

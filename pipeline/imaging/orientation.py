@@ -9,7 +9,7 @@ is believed unless the heart clearly contradicts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,8 +37,11 @@ TURNS_DEG = tuple(range(0, 360, 45))
 """In-plane turns of the views that vote on how the ventricles lie."""
 
 LESS_DOUBT = 0.85
-"""Where ventricles lie as the file says, they are taken for mirrored when the network's doubt falls
-below this share by mirroring them back."""
+"""Where ventricles lie as the file says, they are taken for mirrored, or for stored base first,
+when the network's doubt falls below this share by mirroring or exchanging them back."""
+
+LEVEL_RISE = 0.0
+"""Only a heart that does not taper towards its apex may have been stored base first."""
 
 NO_MORE_DOUBT = 1.1
 """No view is better than the file's in which the network's doubt grows by more."""
@@ -109,15 +112,31 @@ def find_orientation(look: Look) -> Orientation:
     labels, doubt = look(AS_THE_FILE_SAYS)
     lie = lie_of(labels)
     if lie.is_canonical:
-        mirrored = _orientation(lie.right, True, False)
-        less, allowed = _doubt_if_canonical(look, mirrored), LESS_DOUBT * doubt
-        return mirrored if lie.right.any() and less < allowed else AS_THE_FILE_SAYS
+        others = [_orientation(lie.right, True, False)] if lie.right.any() else []
+        if lie.rise < LEVEL_RISE:
+            others += [_orientation(lie.right, mirrored, True) for mirrored in (False, True)]
+        return _less_doubted(look, AS_THE_FILE_SAYS, doubt, others)
     right, rise = _vote(look)
     upside_down = rise < LEAST_RISE
     candidates = [_orientation(right, mirrored, upside_down) for mirrored in (False, True)]
     doubts = [_doubt_if_canonical(look, one) for one in candidates]
     best = int(np.argmin(doubts))
-    return candidates[best] if doubts[best] < NO_MORE_DOUBT * doubt else AS_THE_FILE_SAYS
+    if doubts[best] >= NO_MORE_DOUBT * doubt:
+        return AS_THE_FILE_SAYS
+    if upside_down or rise >= LEVEL_RISE:
+        return candidates[best]
+    exchanged = [_orientation(right, mirrored, True) for mirrored in (False, True)]
+    return _less_doubted(look, candidates[best], doubts[best], exchanged)
+
+
+def _less_doubted(
+    look: Look, usual: Orientation, doubt: float, others: Sequence[Orientation]
+) -> Orientation:
+    """An orientation, or another in which the network's doubt is clearly less."""
+    doubts = [_doubt_if_canonical(look, one) for one in others]
+    if not others or min(doubts) >= LESS_DOUBT * doubt:
+        return usual
+    return others[int(np.argmin(doubts))]
 
 
 def _doubt_if_canonical(look: Look, orientation: Orientation) -> float:

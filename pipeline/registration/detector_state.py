@@ -139,6 +139,8 @@ class Rhythm:
     """How long after a beat an echo of it comes; 0 where there is none."""
     echo_height: float
     """Its energy, as a share of the beat's."""
+    echo_breadth: float
+    """Its height over steepness, as a share of the beat's."""
     echo_share: float
     """How often, of late, one came."""
     echoed: bool

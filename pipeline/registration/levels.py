@@ -40,9 +40,10 @@ def wave_levels(
                 count += 1
             best, best_at = 0.0, i
     seen.sort()
-    if count == 0:
-        return 0.8 * seen[-1], seen[int(0.7 * len(seen))], False, False
     found = np.sort(waves[:count])
+    # A lead that shows nothing has waves of no height.
+    if count == 0 or found[-1] <= 0.0:
+        return 0.8 * seen[-1], seen[int(0.7 * len(seen))], False, False
     lone = count > 1 and found[-2] < LONE * found[-1]
     high = found[found > 0.4 * found[max(0, count - 2)]]
     level = 0.9 * high[len(high) // 2]

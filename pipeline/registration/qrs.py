@@ -186,7 +186,7 @@ def _judge(at: int, plan: Plan, s: State) -> bool:
         since_s = (at - now.before.last_at) / plan.rate_hz
     now.after = False
     usual_t_wave = not instead and is_usual_t_wave(since_s, height, plan, s)
-    echo = not instead and is_echo(since_s, height, s)
+    echo = not instead and is_echo(at, since_s, height, plan, s)
     if since_s < REFRACTORY_S or usual_t_wave or echo:
         return False
     if not is_beat(since_s, height, plan, s) or not resembles(at, since_s, height, plan, s):
@@ -313,7 +313,7 @@ def _accept(at: int, plan: Plan, s: State) -> bool:
     for lead in s.leads:
         lead.before = lead.usual
     _learn_interval(at, plan, s)
-    keep_beat(at, height, wave.likeness, s)
+    keep_beat(at, height, wave.likeness, plan, s)
     anew = learn_echo(plan, s) or anew
     rhythm.last_at, rhythm.last_height, rhythm.last_likeness = at, height, wave.likeness
     rhythm.last_tall, rhythm.last_steep = now.tall, now.steep
