@@ -11,7 +11,17 @@ from pipeline.compiled import door
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-_DETECTOR = ("detector_state", "waves", "quality", "envelope", "levels", "rules", "leads", "qrs")
+_DETECTOR = (
+    "detector_state",
+    "waves",
+    "quality",
+    "envelope",
+    "levels",
+    "rules",
+    "echoes",
+    "leads",
+    "qrs",
+)
 _SOURCES = (*_DETECTOR, "intervals", "ticks")
 
 

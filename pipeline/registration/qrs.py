@@ -16,7 +16,8 @@ With every sample, in this order:
 4. ``fuse``: leads add up, each in units of its own beats, weighted by how far those stand out of
    what lies between (inverse variance), so a lead that is lost or noisy has no say.
 5. ``_decide``: the highest sum that nothing exceeded for ``confirm`` samples is a wave. ``_judge``
-   takes it for a beat if it is none of noise, T waves and P waves (``rules``). It may also show
+   takes it for a beat if it is none of noise, T waves and P waves (``rules``), nor an echo of the
+   last beat (``echoes``). It may also show
    that the beat before was its P wave, or in a fast heart a T wave: that one is unlearnt.
 6. ``_look_back``: when a beat is overdue, the highest wave since the last one is judged again, by
    lower thresholds; after a long silence levels are learnt again (``_learn_again``).
@@ -29,6 +30,7 @@ from __future__ import annotations
 from pipeline.geometry import Float
 from pipeline.registration.compiled import asked, inner, within
 from pipeline.registration.detector_state import KEPT_INTERVALS, KEPT_WAVES, Plan, State
+from pipeline.registration.echoes import is_echo, keep_beat, learn_echo
 from pipeline.registration.envelope import store
 from pipeline.registration.leads import SILENT_EVERY_S, fuse, refuse_knocks, refuse_silent
 from pipeline.registration.levels import (
@@ -46,12 +48,9 @@ from pipeline.registration.rules import (
     T_WAVE_S,
     VERY_ALIKE,
     is_beat,
-    is_echo,
     is_sharper_than_last,
     is_usual_t_wave,
-    keep_beat,
     last_may_be_p_wave,
-    learn_echo,
     learn_stature,
     learn_t_wave,
     measure_stature,

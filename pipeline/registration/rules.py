@@ -8,17 +8,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from pipeline.registration.compiled import inner
-from pipeline.registration.detector_state import (
-    KEPT_BEATS,
-    SHAPE_POINTS,
-    T_STEP_S,
-    T_STEPS,
-    Plan,
-    State,
-)
+from pipeline.registration.detector_state import SHAPE_POINTS, T_STEP_S, T_STEPS, Plan, State
 from pipeline.registration.waves import ALIKE, measure_beat, smooth_window
 
 # A beat at all: is it higher than noise?
@@ -121,22 +112,6 @@ SPLIT_S = 0.08
 FIRST_BEATS, TOWERING = 12, 1.9
 """Among so many first beats two of so much energy are the beats; the others were P waves of a heart
 that beats slower."""
-# No beat at all, though as sharp: what blood in the scanner's field adds as its flow turns.
-ECHO_FROM_S, ECHO_UNTIL_S, ECHO_SPREAD_S = 0.22, 0.46, 0.06
-"""An echo comes so long after its beat, with little spread from beat to beat."""
-ECHO_HEIGHT, ECHO_EVEN_HEIGHT, EVENLY = 0.65, 0.5, 0.1
-"""It has on average less than this share of the beat's energy; or than the second, where both take
-turns at intervals as even as the third: so do beats of a racing heart, one larger than the next."""
-ECHO_LONGEST_S, ECHO_STEADY = 1.25, 0.8
-"""Beats it follows are no farther apart, for a ventricle's that follow each of the heart's own have
-a pause after them; and their shortest interval has this share of their longest."""
-ECHO_BROAD, ECHO_UNLIKE = 1.4, 0.03
-"""What is broader than the beats by the first factor comes from a ventricle; and what is as alike
-to the usual beat as they are, any one as any other but for the second difference, from the
-atria: noise takes more of the likeness of low ones."""
-ECHO_HIGHER, ECHO_NEAR_S, ECHO_FOLLOW, ECHO_GONE = 1.5, 0.05, 1 / 16, 0.15
-"""What comes within so long of its time, and is no higher than by the first factor, is one. What is
-known of it follows by a share, until it came after fewer than the last of these."""
 SPAN_S, RISE_S = 0.060, 0.012
 """Height is measured this far to either side of a wave's middle; steepness is change in so long."""
 
@@ -334,86 +309,6 @@ def is_sharper_than_last(height: float, s: State) -> bool:
     rhythm, now = s.now[0].rhythm, s.now[0]
     sharper = now.steep * rhythm.last_tall > SHARPER * (rhythm.last_steep * now.tall)
     return bool(height >= rhythm.last_height and sharper)
-
-
-@inner
-def keep_beat(at: int, height: float, likeness: float, plan: Plan, s: State) -> None:
-    """Keep a beat among the latest, and what is known of echoes, now that its predecessor's time
-    for one is over. After a pause it does not count: a beat of a ventricle may have come before."""
-    now, rhythm = s.now[0], s.now[0].rhythm
-    slot = rhythm.beats % KEPT_BEATS
-    rhythm.at[slot], rhythm.height[slot], rhythm.alike[slot] = at, height, likeness
-    rhythm.breadth[slot] = now.tall / now.steep if now.steep > 0.0 else 1.0
-    if rhythm.echo_s > 0.0:
-        paused = at - rhythm.last_at > ECHO_LONGEST_S * plan.rate_hz
-        came = 1.0 if rhythm.echoed and not paused else 0.0
-        rhythm.echo_share += ECHO_FOLLOW * (came - rhythm.echo_share)
-        if rhythm.echo_share < ECHO_GONE:
-            rhythm.echo_s = 0.0
-    rhythm.echoed = False
-
-
-@inner
-def learn_echo(plan: Plan, s: State) -> bool:
-    """Whether every other of the latest beats is now known to be the echo of the one before it."""
-    rhythm = s.now[0].rhythm
-    if rhythm.echo_s > 0.0 or rhythm.beats < KEPT_BEATS:
-        return False
-    beats, echoes, breadth, echo_breadth = 0.0, 0.0, 0.0, 0.0
-    least, most, echo_least, echo_most = np.inf, -np.inf, np.inf, -np.inf
-    soonest, latest, shortest, longest = np.inf, 0.0, np.inf, 0.0
-    pairs = KEPT_BEATS // 2
-    for pair in range(pairs):
-        first = (rhythm.beats + 1 + 2 * pair) % KEPT_BEATS
-        echo, after = (first + 1) % KEPT_BEATS, (first + 2) % KEPT_BEATS
-        since_s = (rhythm.at[echo] - rhythm.at[first]) / plan.rate_hz
-        whole_s = (rhythm.at[after] - rhythm.at[first]) / plan.rate_hz
-        soonest, latest = min(soonest, since_s), max(latest, since_s)
-        shortest, longest = min(shortest, whole_s), max(longest, whole_s)
-        beats += rhythm.height[first] / pairs
-        echoes += rhythm.height[echo] / pairs
-        breadth += rhythm.breadth[first] / pairs
-        echo_breadth += rhythm.breadth[echo] / pairs
-        least, most = min(least, rhythm.alike[first]), max(most, rhythm.alike[first])
-        echo_least = min(echo_least, rhythm.alike[echo])
-        echo_most = max(echo_most, rhythm.alike[echo])
-    early = soonest < ECHO_FROM_S or latest > ECHO_UNTIL_S or latest - soonest > ECHO_SPREAD_S
-    steady = longest < ECHO_LONGEST_S and shortest > ECHO_STEADY * longest
-    unlike = max(least - echo_most, echo_least - most)
-    broad = echo_breadth > ECHO_BROAD * breadth
-    if early or not steady or broad or unlike < ECHO_UNLIKE:
-        return False
-    even = abs(soonest + latest - 0.5 * (shortest + longest)) < EVENLY * longest
-    if echoes > (ECHO_EVEN_HEIGHT if even else ECHO_HEIGHT) * beats:
-        return False
-    rhythm.echo_s, rhythm.echo_height = 0.5 * (soonest + latest), echoes / beats
-    rhythm.echo_breadth = echo_breadth / breadth if breadth > 0.0 else 1.0
-    rhythm.echo_share = 1.0
-    return True
-
-
-@inner
-def is_echo(at: int, since_s: float, height: float, plan: Plan, s: State) -> bool:
-    """Whether a wave comes when an echo of the last beat is due, and is no higher than one,
-    not much broader, and not as alike to the usual beat as what it follows."""
-    now, rhythm = s.now[0], s.now[0].rhythm
-    share = height / rhythm.last_height if rhythm.last_height > 0.0 else 1.0
-    if rhythm.echo_s <= 0.0 or abs(since_s - rhythm.echo_s) > ECHO_NEAR_S:
-        return False
-    if share > ECHO_HIGHER * rhythm.echo_height:
-        return False
-    broadest = ECHO_BROAD * rhythm.echo_breadth
-    if now.tall * rhythm.last_steep > broadest * rhythm.last_tall * now.steep:
-        return False
-    wave = s.found[now.found]
-    measure_beat(at, wave, plan, s)
-    if wave.likeness > max(rhythm.last_likeness, ALIKE) - ECHO_UNLIKE:
-        return False
-    if share * ECHO_HIGHER > rhythm.echo_height:
-        rhythm.echoed = True
-        rhythm.echo_s += ECHO_FOLLOW * (since_s - rhythm.echo_s)
-        rhythm.echo_height += ECHO_FOLLOW * (share - rhythm.echo_height)
-    return True
 
 
 @inner
