@@ -102,7 +102,7 @@ def classic(tmp_path_factory: pytest.TempPathFactory) -> Written:
 
 needs_validator = pytest.mark.skipif(
     shutil.which("dciodvfy") is None,
-    reason="dciodvfy is not on the PATH; Debian's package dicom3tools has it",
+    reason="dciodvfy is not on the PATH; the package dicom3tools, Python's or Debian's, has it",
 )
 
 
@@ -134,7 +134,7 @@ def validator_says(path: Path) -> str:
 
 @pytest.mark.skipif(
     shutil.which("dcentvfy") is None,
-    reason="dcentvfy is not on the PATH; Debian's package dicom3tools has it",
+    reason="dcentvfy is not on the PATH; the package dicom3tools, Python's or Debian's, has it",
 )
 def test_the_objects_of_a_study_agree_about_what_they_share(written: Written) -> None:
     command = ["dcentvfy", *map(str, written.paths())]
