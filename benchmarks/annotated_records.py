@@ -35,11 +35,13 @@ MARGIN_S, LEARNT_S = 0.5, 10.0
 
 def beats_of(record: Path) -> Float:
     """Times of the annotated beats, s."""
-    kind = next((one for one in ("atr", "qrs") if record.with_suffix(f".{one}").exists()), None)
+    kind = next((one for one in ("atr", "qrs") if Path(f"{record}.{one}").exists()), None)
     if kind is None:
         raise SystemExit(f"{record}: no .atr or .qrs beside it; annotations are needed")
     read = wfdb.rdann(str(record), kind)
     told = [at for at, symbol in zip(read.sample, read.symbol, strict=True) if symbol in BEATS]
+    if len(told) < 2:
+        raise SystemExit(f"{record}.{kind}: {len(told)} beats are annotated; two are needed")
     return np.array(told) / wfdb.rdheader(str(record)).fs
 
 

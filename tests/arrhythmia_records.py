@@ -317,14 +317,15 @@ def record(case: str, seed: int, duration_s: float = 120.0, rate_hz: float = 360
 
 
 def matched(found_s: Float, truth_s: Float, window_s: float = 0.15) -> Float:
-    """For each true beat the found one that stands for it, or -1: one to one, nearest first."""
-    pairs = np.full(len(truth_s), -1)
-    gaps = np.abs(found_s[None, :] - truth_s[:, None]) if len(found_s) else np.empty((0, 0))
-    taken = np.zeros(len(found_s), dtype=bool)
-    for flat in np.argsort(gaps, axis=None):
-        i, j = divmod(int(flat), len(found_s))
-        if gaps[i, j] > window_s:
-            break
+    """For each true beat the found one (these in order) that stands for it, or -1: one to one,
+    nearest first."""
+    pairs, taken = np.full(len(truth_s), -1), np.zeros(len(found_s), dtype=bool)
+    near = [
+        (abs(found_s[j] - one_s), i, j)
+        for i, one_s in enumerate(truth_s)
+        for j in range(*np.searchsorted(found_s, (one_s - window_s, one_s + window_s)))
+    ]
+    for _, i, j in sorted(near):
         if pairs[i] < 0 and not taken[j]:
             pairs[i], taken[j] = j, True
     return pairs
