@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_synth.beat import end_systole_phase, kick_onset_phase, warp_phase
-from pipeline.imaging import network
+from pipeline.imaging import inference, network
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.inference import (
     PlaneProbability,
@@ -151,6 +151,64 @@ def _right_heart(of_atrium):
     value[:, 0, RIGHT[0], 0], value[:, 0, RIGHT[1], 0] = share, np.float32(0.95) - share
     value[:, 0, MUSCLE] = 0.05
     return value
+
+
+def test_slices_whose_labels_come_and_go_are_looked_at_in_all_ways(monkeypatch):
+    """Of 24 phases of 12 slices there is time for two looks at each. In these two of the three
+    planes of slice 4 are taken for the atrium twice a beat, in the other three never."""
+    frame = np.diag([1.3, 1.3, 8.0, 1.0])
+    cine = Cine(np.zeros((24, 12, 60, 60), np.float32), frame, np.arange(24) / 24, 1.0)
+    view = View(frame, np.eye(3), np.zeros(3), (60, 60), tuple(range(12)))
+    disc = np.hypot(*(np.mgrid[:60, :60] - 30)) < 20
+    cavity, atrium = LABELS["lv_cavity"], LABELS["left_atrium"]
+    looks = []
+
+    def predicted(_cine, view, phase, chosen, turn_deg, _alone):
+        chance = np.zeros((len(chosen), 3, 7, *view.shape), np.float32)
+        chance[:, :, 0] = 1
+        for place, number in enumerate(chosen):
+            astray = (
+                number == 4 and phase % 12 == 0 and abs(turn_deg) in (10, 20) and len(chosen) > 1
+            )
+            chance[place, :, :, disc] = np.eye(7)[cavity]
+            if astray:
+                chance[place, :2, :, disc] = np.eye(7)[atrium]
+        looks.append((phase, tuple(chosen), turn_deg))
+        return chance
+
+    monkeypatch.setattr(inference, "_predicted", predicted)
+    found = inference.label_probability(cine, view, 5).value[:, :, :, 30, 30]
+    base = [look for look in looks if look[1] == tuple(range(12))]
+    more = [look for look in looks if look[1] == (4,)]
+    assert len(base) + len(more) == len(looks)
+    for phase in range(24):
+        ways = [[turn for k, _, turn in kind if k == phase] for kind in (base, more)]
+        assert len(ways[0]) == 2
+        assert sorted(ways[0] + ways[1]) == sorted(inference.turns_deg(phase, 5))
+    of_slice = found.reshape(24, 12, 3, 7)
+    np.testing.assert_allclose(of_slice[::12, 4, :2, atrium], 2 / 5, atol=1e-6)
+    np.testing.assert_allclose(of_slice[::12, 4, :2, cavity], 3 / 5, atol=1e-6)
+    np.testing.assert_allclose(of_slice[1::12, 4, :, cavity], 1, atol=1e-6)
+    np.testing.assert_allclose(np.delete(of_slice, 4, axis=1)[..., cavity], 1, atol=1e-6)
+
+
+@given(
+    phase=st.integers(0, 3),
+    most=st.integers(1, 5),
+    data=st.data(),
+)
+def test_more_looks_are_others_and_as_many_as_there_is_time_for(phase, most, data):
+    count = data.draw(st.integers(1, most))
+    images = data.draw(st.integers(1, 20_000))
+    first, more = (
+        inference.turns_deg(phase, count),
+        inference.more_turns_deg(phase, count, most, images),
+    )
+    assert not set(first) & set(more)
+    assert set(more) <= set(inference.turns_deg(phase, most))
+    others = len(set(inference.turns_deg(phase, most)) - set(first))
+    assert len(more) <= 1 or len(more) * images <= 2 * inference.LOOKS + images / 2
+    assert len(more) == others or (len(more) + 1) * images > 2 * inference.LOOKS - images / 2
 
 
 @given(

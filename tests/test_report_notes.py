@@ -343,6 +343,19 @@ def test_phases_too_few_to_tell_where_walls_are_between_them_are_told():
         ({"astray_mm": {"5": 19.4}}, {}, "slice 5 showed the heart 19 mm beside"),
         ({}, {"left_out_ml": {"aorta": {"4": 9.1}}}, "surfaces: aorta leaves out up to 9.1 ml"),
         ({}, {"crossing_triangles": {"heart": 4}}, "surfaces: heart passes through itself (4"),
+        (
+            {}, {"off_mm": {"epicardium": {"3": 1.6, "7": 2.0}}},
+            "surfaces: epicardium lies 2.0 mm or more beside its labels",
+        ),
+        (
+            {}, {"misfit_ml": {"aorta": {"3": [9.0, 10.0], "4": [12.0, 14.0]}}},
+            "surfaces: aorta encloses 12.0 ml in phase 4, its labels 14.0 ml; look at the contours",
+        ),
+        ({"flicker_beats": {"8": 0.07}}, {}, None),
+        (
+            {"flicker_beats": {"8": 0.1, "10": 0.02, "9": 0.15}}, {},
+            "labels of slice 8 to 9 came and went from phase to phase, and are a mean over 15 % of",
+        ),
         # Stroke volumes of 80 and 69.5 ml are 0.13 of the larger one apart, of 80 and 67 ml 0.16.
         (
             {}, {"volumes_ml": {"lv_endocardium": [150.0, 70.0], "rv_endocardium": [160.0, 90.5]}},

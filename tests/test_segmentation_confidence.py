@@ -22,6 +22,7 @@ from pipeline.imaging.no_heart import (
     _require_cavity,
     _require_right_ventricle,
     missed_hearts,
+    require_understood,
 )
 from pipeline.imaging.segmentation import _astray_mm, segment_cine
 from pipeline.imaging.settings import SegmentSettings
@@ -59,6 +60,33 @@ def with_image(cine, phase, number, image):
     images = cine.intensity.copy()
     images[phase, number] = image
     return replace(cine, intensity=images)
+
+
+@pytest.mark.parametrize(
+    ("number", "phases", "refused"),
+    [(4, 1, True), (7, 1, False), (7, 10, False), (7, 11, True), (6, 1, False), (5, 1, True)],
+)
+def test_images_beyond_the_left_ventricle_may_be_doubted_if_they_are_few(number, phases, refused):
+    """It is on slices 1 to 5 all the time, on slice 6 for less than half of the beat.
+
+    Ten of 200 images are one in twenty.
+    """
+    drawn = np.zeros((25, SLICES, 64, 64), np.uint8)
+    drawn[:, 1:6, 20:40, 20:40] = LABELS["lv_myocardium"]
+    drawn[:12, 6, 20:40, 20:40] = LABELS["lv_cavity"]
+    drawn[:, 6:, 30:50, 30:50] = LABELS["aorta"]
+    confidence = np.full((25, SLICES), 0.9)
+    confidence[:phases, number] = 0.39
+    view = view_of(
+        Cine(np.zeros((25, SLICES, 64, 64), np.float32), np.eye(4), np.arange(25) / 25, 1.0)
+    )
+    if not refused:
+        require_understood(drawn, confidence, view, QUICK)
+        return
+    place = rf"phase 0, slice {view.order[number]}: .*{phases} images"
+    with pytest.raises(StageError, match=place) as told:
+        require_understood(drawn, confidence, view, QUICK)
+    assert ("short axis?" in str(told.value)) == (phases > 10)
 
 
 def test_a_good_study_of_low_signal_is_trusted(understood):

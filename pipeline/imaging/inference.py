@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.geometry import Float, Float32
 from pipeline.imaging.cine import Cine
+from pipeline.imaging.flicker import doubted_planes
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.network import (
     CLASSES,
@@ -134,22 +135,35 @@ def label_probability(
 
     Each slice gives three planes where its neighbours are the stack's own; where slices lie
     closer than that, only its own. Images are shown turned in up to ``most_views`` ways
-    (`turns_deg`), whose probabilities are averaged.
+    (`turns_deg`), whose probabilities are averaged: in as many as there is time for, and all of
+    them where labels come and go from phase to phase (`doubted_planes`).
     """
     step = neighbour_steps(view.slice_step_mm)
     planes = PLANES if step == 1 else 1
     phases, slices = len(cine.intensity), len(view.order)
     count = count_turns(phases * slices, most_views)
-    value = np.empty((phases, slices * planes, CLASSES, *view.shape), np.float32)
+    value = np.zeros((phases, slices * planes, CLASSES, *view.shape), np.float32)
+    total = value.reshape(phases, slices, planes, CLASSES, *view.shape)
+
+    def look(phase: int, chosen: Sequence[int], turn_deg: float) -> None:
+        alone = count > 1 and turn_deg == ALONE_DEG
+        seen = _predicted(cine, view, phase, chosen, turn_deg, alone)
+        total[phase, chosen] += seen[:, _kept(planes)]
+
     for phase in range(phases):
-        total = value[phase].reshape(slices, planes, CLASSES, *view.shape)
-        for number, turn_deg in enumerate(turns_deg(phase, count)):
-            alone = count > 1 and turn_deg == ALONE_DEG
-            seen = _predicted(cine, view, phase, turn_deg, alone)[:, _kept(planes)]
-            np.add(total, seen, out=total) if number else np.copyto(total, seen)
-        total /= count
+        for turn_deg in turns_deg(phase, count):
+            look(phase, range(slices), turn_deg)
+        total[phase] /= count
         if progress is not None:
             progress(phase + 1, phases)
+    doubted = doubted_planes(value, view.pixel_mm).reshape(slices, planes).any(axis=1)
+    chosen = np.flatnonzero(doubted).tolist()
+    for phase in range(phases) if chosen else ():
+        more = more_turns_deg(phase, count, most_views, phases * len(chosen))
+        total[phase, chosen] *= count
+        for turn_deg in more:
+            look(phase, chosen, turn_deg)
+        total[phase, chosen] /= count + len(more)
     return PlaneProbability(value, view, planes)
 
 
@@ -166,15 +180,26 @@ def turns_deg(phase: int, count: int) -> tuple[float, ...]:
     return tuple(way * turn_deg for turn_deg in TURNS_DEG[:count])
 
 
+def more_turns_deg(phase: int, count: int, most: int, images: int) -> tuple[float, ...]:
+    """Turns in which the doubted among a phase's images are shown, too, after ``count`` others.
+
+    ``images`` are doubted in all; however many they are, they are shown about twice `LOOKS` times.
+    """
+    others = [one for one in turns_deg(phase, most) if one not in turns_deg(phase, count)]
+    return tuple(others[: max(1, round(2 * LOOKS / images))])
+
+
 def _kept(planes: int) -> slice:
     """Which of the network's planes are used: all, or the middle one."""
     return slice(None) if planes == PLANES else slice(PLANES // 2, PLANES // 2 + 1)
 
 
-def _predicted(cine: Cine, view: View, phase: int, turn_deg: float, alone: bool) -> Float32:
+def _predicted(
+    cine: Cine, view: View, phase: int, chosen: Sequence[int], turn_deg: float, alone: bool
+) -> Float32:
     """Probabilities ``(slice, plane, class, row, column)`` on the view, seen turned."""
     seen = view.varied(turn_deg) if turn_deg else view
-    chance = predict(network_images(cine, seen, phase, range(len(view.order)), alone=alone))
+    chance = predict(network_images(cine, seen, phase, chosen, alone=alone))
     if not turn_deg:
         return chance
     matrix = view.pixels_of(seen)

@@ -31,6 +31,10 @@ renderers show 0.4 and more, and stacks of the tip alone no atrium."""
 MOST_NAMED = 8
 """Images that one message names."""
 
+MOST_DOUBTED = 0.05
+"""Share of all images that may be doubted beyond the left ventricle: of a patient's stack across
+the body, which shows the heart in no short axis, a fifth was."""
+
 LEAST_SHARE = 0.2
 """A slice with less than this share of the heart that both its neighbours show in one place is
 spoilt."""
@@ -88,7 +92,11 @@ def _numbers(which: Mask) -> str:
 def require_understood(
     drawn: Label, confidence: Float, view: View, settings: SegmentSettings
 ) -> None:
-    """Refuse an image that shows no heart between two that do, or that the network doubts."""
+    """Refuse an image that shows no heart between two that do, or that the network doubts.
+
+    A few doubted images beyond the left ventricle, of great vessels or of the belly, are borne:
+    its surfaces do not hang on them.
+    """
     gaps = missed_hearts(drawn, view.pixel_mm)
     if len(gaps):
         phase, number = gaps[0]
@@ -97,19 +105,28 @@ def require_understood(
             "both sides show it; check this image. To do without the slice, draw it between its "
             f"neighbours: cine.spoilt_slices: [{view.order[number]}] in study.yaml"
         )
-    if confidence.min() < settings.min_confidence:
+    low = confidence < settings.min_confidence
+    if (low & _shows_left_ventricle(drawn)).any() or low.mean() > MOST_DOUBTED:
         worst = np.unravel_index(confidence.argmin(), confidence.shape)
-        low = np.argwhere(confidence < settings.min_confidence)
-        others = ", ".join(f"{k}/{view.order[z]}" for k, z in low[:MOST_NAMED])
+        named = np.argwhere(low)
+        others = ", ".join(f"{k}/{view.order[z]}" for k, z in named[:MOST_NAMED])
+        many = "; do slices lie across the left ventricle, in its short axis?"
         # Rounded up it could read as the threshold that it is below.
         least = np.floor(100 * confidence.min()) / 100
         raise StageError(
             f"phase {worst[0]}, slice {view.order[worst[1]]}: the labels are not certain enough: "
             f"confidence {least:.2f}, at least {settings.min_confidence:.2f} is needed "
-            f"({len(low)} images have less, phase/slice {others}"
-            f"{' ...' if len(low) > MOST_NAMED else ''}); check them, do without a slice inside "
+            f"({len(named)} images have less, phase/slice {others}"
+            f"{' ...' if len(named) > MOST_NAMED else ''}); check them, do without a slice inside "
             "the stack (cine.spoilt_slices in study.yaml), or lower segment.min_confidence"
+            f"{many if low.mean() > MOST_DOUBTED else ''}"
         )
+
+
+def _shows_left_ventricle(drawn: Label) -> Mask:
+    """``(slice,)``: whether cavity or muscle is drawn in half of the phases."""
+    left = np.isin(drawn, [LABELS["lv_cavity"], LABELS["lv_myocardium"]]).any(axis=(2, 3))
+    return np.asarray(left.mean(axis=0) >= 0.5)
 
 
 def missed_hearts(drawn: Label, pixel_mm: float) -> Integer:

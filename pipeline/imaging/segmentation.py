@@ -14,6 +14,7 @@ from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_room_for_a_heart
+from pipeline.imaging.flicker import settle_flicker
 from pipeline.imaging.in_step import out_of_step
 from pipeline.imaging.inference import (
     PlaneProbability,
@@ -23,7 +24,7 @@ from pipeline.imaging.inference import (
     settle_tricuspid,
 )
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
-from pipeline.imaging.labels import most_probable
+from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import (
@@ -63,6 +64,10 @@ class Segmentation:
 
     astray_mm: dict[int, float]
     """Slices whose heart lay farther aside than another usual breath-hold takes it, and how far."""
+
+    flicker_beats: dict[int, float]
+    """Slices on which a ventricle's labels came and went, and the width of their mean in time
+    (`pipeline.imaging.flicker`)."""
 
     out_of_step: dict[int, dict[str, float]]
     """Slices that do not beat with the others (`pipeline.imaging.in_step.out_of_step`)."""
@@ -109,6 +114,7 @@ def segment_cine(
     confidence = slice_confidence(cine, found, seen)
     require_understood(seen, confidence, found.view, settings)
     settle_plain_blood(found, cine)
+    flicker = settle_flicker(found.value, cine.phases, found.view.pixel_mm)
     settle_tricuspid(found.value)
     share = settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2)
     blend_phases(found.value, share, cine.phases)
@@ -135,6 +141,7 @@ def segment_cine(
         heart_mr_from_index,
         confidence[:, stored],
         _astray_mm(shifts_mm, numbers),
+        _flicker_beats(flicker, found),
         {int(numbers[place]): apart[place] for place in sorted(apart, key=lambda k: numbers[k])},
         tuple(crossings.agreement(k) for k in range(len(views))),
         place.orientation,
@@ -154,6 +161,15 @@ def _astray_mm(shifts_mm: Float, numbers: Integer) -> dict[int, float]:
         for number, mm in sorted(zip(numbers, aside_mm, strict=True))
         if mm > ASTRAY_MM
     }
+
+
+def _flicker_beats(widths_beats: Float, found: PlaneProbability) -> dict[int, float]:
+    """Of each slice, by its number, the widest mean of a ventricle's labels, if any."""
+    ventricles = [LABELS[name] for name in ("lv_cavity", "lv_myocardium", "rv_cavity")]
+    of_ventricles = widths_beats[:, ventricles].max(axis=1)
+    widest = of_ventricles.reshape(-1, found.planes_a_slice).max(axis=1)
+    by_number = sorted(zip(found.view.order, widest.tolist(), strict=True))
+    return {number: width for number, width in by_number if width}
 
 
 def _drawn(found: PlaneProbability) -> Label:

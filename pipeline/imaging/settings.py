@@ -22,7 +22,8 @@ class SegmentSettings(Section):
     would have in a plain mean; with fewer, it falls as the square of their distance grows."""
 
     min_confidence: float = Field(0.4, ge=0, le=1)
-    """An image whose labels are trusted less counts as not understood and fails the stage."""
+    """An image whose labels are trusted less counts as not understood and fails the stage; a few
+    beyond the left ventricle do not."""
 
     min_ventricle_ml: float = Field(30.0, gt=0, le=1000)
     """A left ventricle (cavity and muscle) smaller than this counts as not found."""

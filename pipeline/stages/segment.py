@@ -38,6 +38,7 @@ def run(job: Job) -> dict[str, Any]:
         "cut_off": cut_off(found.labels),
         "cut_sideways": cut_sideways(found.labels, cine.intensity),
         "astray_mm": found.astray_mm,
+        "flicker_beats": found.flicker_beats,
         "out_of_step": found.out_of_step,
         "views_agree": {one.name: lines for one, lines in zip(views, found.views, strict=True)},
         "orientation": str(found.orientation),

@@ -32,6 +32,8 @@ def run(job: Job) -> dict[str, Any]:
         "mended_phases": found.mended_phases,
         "crossing_triangles": found.crossing_triangles,
         "left_out_ml": found.left_out_ml,
+        "off_mm": found.off_mm,
+        "misfit_ml": found.misfit_ml,
         "left_out": found.left_out,
     }
 

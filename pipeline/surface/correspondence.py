@@ -32,6 +32,9 @@ ELASTIC_STEPS = 2
 FINISHING_STEPS = 2
 # Vertices that may end off the surface: a thin tip that a phase does not show has nowhere to go.
 STRAY_SHARE = 0.05
+# How many voxels off the others may be at most: more, and the shape of a phase has nothing to do
+# with the one before.
+FARTHEST_VOXELS = 3.0
 # Vertices of the surfaces within that tell an outer one where to go, and how near they should be.
 COMPANIONS = 12
 COMPANION_MM = 4.0
@@ -155,7 +158,7 @@ def carry_through_cycle(
     Raises
     ------
     StageError
-        When a twentieth of the vertices end more than a voxel from the surface of some phase.
+        When a twentieth of the vertices end more than three voxels from the surface of some phase.
     """
     count = len(levels)
     carrier = make_carrier(template)
@@ -200,7 +203,7 @@ def carry_along(
     Raises
     ------
     StageError
-        When a twentieth of the vertices end more than a voxel from the surface of some phase.
+        When a twentieth of the vertices end more than three voxels from the surface of some phase.
     """
     carrier = make_carrier(template)
     way_at, _ = _companions(template.vertices_mm, within_mm, reference)
@@ -279,14 +282,20 @@ def _chain(carrier: Carrier, start_mm: Float, levels: Sequence[LevelSet]) -> lis
 
 
 def _require_arrival(vertices_mm: Float, level: LevelSet, number: int, phase: float) -> None:
-    """StageError unless the vertices came to lie on the zero level, but for a few."""
-    off_mm = float(np.quantile(np.abs(level.sample(vertices_mm)[0]), 1 - STRAY_SHARE))
-    if off_mm > level.spacing_mm:
+    """StageError unless the vertices came to lie near the zero level, but for a few."""
+    off_mm = distance_off_mm(vertices_mm, level)
+    allowed_mm = FARTHEST_VOXELS * level.spacing_mm
+    if off_mm > allowed_mm:
         raise StageError(
             f"the surface could not follow to phase {number} (at {phase:.3f} of the beat): "
-            f"{STRAY_SHARE:.0%} of its vertices end {off_mm:.1f} mm or more from it, one voxel is "
-            "allowed; look at the labels of that phase"
+            f"{STRAY_SHARE:.0%} of its vertices end {off_mm:.1f} mm or more from it, "
+            f"{allowed_mm:.1f} mm are allowed; look at the labels of that phase"
         )
+
+
+def distance_off_mm(vertices_mm: Float, level: LevelSet) -> float:
+    """Distance from the zero level that all vertices ``(n, 3)`` but `STRAY_SHARE` keep within."""
+    return float(np.quantile(np.abs(level.sample(vertices_mm)[0]), 1 - STRAY_SHARE))
 
 
 def smooth_in_time(path_mm: Float, phases: Float, width_beats: float) -> Float:

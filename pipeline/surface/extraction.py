@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pipeline.surface.correspondence import (
     Across,
     carry_along,
     carry_through_cycle,
+    distance_off_mm,
     drawn_along,
     restore_volume,
     smooth_in_time,
@@ -47,9 +48,9 @@ REQUIRED_STRUCTURES = ("lv_endocardium", "epicardium")
 # more of theirs, great vessels nearly all; less tells that a stack which ends at the valves shows
 # slivers of them.
 LEAST_KEPT = 0.2
-# Most that a surface may enclose more or less than its labels, in a share of these; what offsetting
-# leaves is under a hundredth.
-VOLUME_TOLERANCE = 0.05
+# By what share a surface may enclose more or less than its labels untold, and by what it may at
+# all; what offsetting leaves is under a hundredth.
+VOLUME_TOLERANCE, LARGEST_MISFIT = 0.05, 0.15
 # Tries at a mesh that passes through itself.
 UNCROSSINGS = 4
 # The interpreter lock leaves nothing for more.
@@ -64,6 +65,8 @@ class _Followed:
     moving: MovingSurface
     mended_phases: int = 0
     crossing_triangles: int = 0
+    off_mm: dict[int, float] = field(default_factory=dict)
+    misfit_ml: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,14 @@ class Extraction:
     left_out_ml: dict[str, dict[int, float]]
     """What of its labels a surface leaves out, by phase: pieces that lie apart from the rest, where
     they hold more than ``VOLUME_TOLERANCE`` of it."""
+
+    off_mm: dict[str, dict[int, float]]
+    """How far, by phase, a twentieth of a surface's vertices lie off its labels or farther, where
+    that is more than a voxel: labels that change from phase to phase as no heart does."""
+
+    misfit_ml: dict[str, dict[int, tuple[float, float]]]
+    """What a surface encloses and what its labels do, by phase, where these differ by more than
+    ``VOLUME_TOLERANCE``, for the same cause."""
 
     left_out: dict[str, str]
     """Structures that have no surface, and why."""
@@ -170,6 +181,8 @@ def extract(
         {name: one.mended_phases for name, one in followed.items()},
         {name: one.crossing_triangles for name, one in followed.items()},
         {name: pieces for name, one in followed.items() if (pieces := _pieces_ml(one.body))},
+        {name: one.off_mm for name, one in followed.items() if one.off_mm},
+        {name: one.misfit_ml for name, one in followed.items() if one.misfit_ml},
         absent | {name: str(one) for name, one in lost.items()},
     )
 
@@ -318,8 +331,10 @@ def _finished(
 
     places, mended, left = zip(*across(sound, range(len(path_mm))), strict=True)
     moving = MovingSurface(np.stack(places), triangles, phases)
-    _require_volumes(moving, body.volumes_mm3)
-    return _Followed(body, moving, sum(mended), sum(left))
+    misfit_ml = _misfit_ml(moving, body.volumes_mm3)
+    off_mm = map(distance_off_mm, moving.vertices_mm, body.levels)
+    far_mm = {k: round(one, 1) for k, one in enumerate(off_mm) if one > body.levels[k].spacing_mm}
+    return _Followed(body, moving, sum(mended), sum(left), far_mm, misfit_ml)
 
 
 def _pieces_ml(body: Body) -> dict[int, float]:
@@ -332,18 +347,27 @@ def _pieces_ml(body: Body) -> dict[int, float]:
     }
 
 
-def _require_volumes(moving: MovingSurface, volumes_mm3: Sequence[float]) -> None:
-    """StageError where a surface encloses something else than its labels do."""
+def _misfit_ml(
+    moving: MovingSurface, volumes_mm3: Sequence[float]
+) -> dict[int, tuple[float, float]]:
+    """Phases in which a surface encloses more or less than its labels do, and what both do, ml.
+
+    StageError where it is quite another volume.
+    """
     enclosed = np.array([moving.at(k).volume_mm3() for k in range(len(volumes_mm3))])
     off = np.abs(enclosed / np.array(volumes_mm3) - 1)
     k = int(off.argmax())
     # Written so that what is not a number fails too.
-    if not off[k] <= VOLUME_TOLERANCE:
+    if not off[k] <= LARGEST_MISFIT:
         raise StageError(
             f"its surface encloses {enclosed[k] / 1000:.1f} ml in phase {k} (at "
             f"{moving.phases[k]:.3f} of the beat), its labels {volumes_mm3[k] / 1000:.1f} ml: the "
             "shape of the reference phase could not be carried there; look at the labels of both"
         )
+    return {
+        one: (round(float(enclosed[one]) / 1000, 1), round(volumes_mm3[one] / 1000, 1))
+        for one in np.flatnonzero(off > VOLUME_TOLERANCE).tolist()
+    }
 
 
 def _placed(followed: _Followed, mr_from_index: Float) -> MovingSurface:
