@@ -17,6 +17,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Float, Label, MovingSurface, nearest_phase, transform_points
 from pipeline.imaging.labels import LABELS
+from pipeline.surface import extraction
 from pipeline.surface.bodies import Body, _without_tunnels, joined
 from pipeline.surface.extraction import STRUCTURES, _misfit_ml, extract
 from pipeline.surface.level_set import LevelSet
@@ -339,6 +340,20 @@ def test_no_surface_encloses_other_than_its_labels():
     found = extract(heart, frame, np.array([0.0, 0.5]), SETTINGS)
     assert "its labels 11.4 ml" in found.left_out["rv_endocardium"]
     assert set(found.surfaces) == {"lv_endocardium", "epicardium", "heart"}
+
+
+def test_what_smoothing_in_time_takes_off_its_labels_is_refused(monkeypatch):
+    """Moved by 5 mm, a ball's surface is off by 5 mm times a cosine that is even in [-1, 1]
+    (Archimedes): by 4.75 mm or more at a twentieth of it."""
+
+    def moved(path_mm, _phases, _width_beats):
+        path_mm[1, :, 0] += 5
+        return path_mm
+
+    heart, frame = balls(0.0)
+    monkeypatch.setattr(extraction, "smooth_in_time", moved)
+    with pytest.raises(StageError, match=r"could not follow to phase 1 .* 4\.\d mm or more"):
+        extract(heart, frame, np.array([0.0, 0.5]), SETTINGS)
 
 
 @pytest.mark.parametrize(

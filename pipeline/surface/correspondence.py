@@ -34,7 +34,7 @@ FINISHING_STEPS = 2
 STRAY_SHARE = 0.05
 # How many voxels off the others may be at most: more, and the shape of a phase has nothing to do
 # with the one before.
-FARTHEST_VOXELS = 3.0
+FARTHEST_VOXELS = 2.0
 # Vertices of the surfaces within that tell an outer one where to go, and how near they should be.
 COMPANIONS = 12
 COMPANION_MM = 4.0
@@ -158,7 +158,7 @@ def carry_through_cycle(
     Raises
     ------
     StageError
-        When a twentieth of the vertices end more than three voxels from the surface of some phase.
+        When a twentieth of the vertices end more than two voxels from the surface of some phase.
     """
     count = len(levels)
     carrier = make_carrier(template)
@@ -173,7 +173,7 @@ def carry_through_cycle(
         # Where the two slid apart, the mean of two places on a bent surface lies off it.
         found = carrier.elastic(levels[phase], blended, carrier.smoothers)
         path[phase] = untangled(found, template.triangles, levels[phase])
-        _require_arrival(path[phase], levels[phase], phase, phases[phase])
+        require_arrival(path[phase], levels[phase], phase, phases[phase])
     return path
 
 
@@ -203,7 +203,7 @@ def carry_along(
     Raises
     ------
     StageError
-        When a twentieth of the vertices end more than three voxels from the surface of some phase.
+        When a twentieth of the vertices end more than two voxels from the surface of some phase.
     """
     carrier = make_carrier(template)
     way_at, _ = _companions(template.vertices_mm, within_mm, reference)
@@ -214,7 +214,7 @@ def carry_along(
         predicted = template.vertices_mm + carrier.smoothers[-2](way_at(k))
         found = carrier.elastic(levels[k], predicted, carrier.smoothers[1:])
         found = untangled(found, template.triangles, levels[k])
-        _require_arrival(found, levels[k], k, phases[k])
+        require_arrival(found, levels[k], k, phases[k])
         return found
 
     return np.stack(list(across(at, range(len(levels)))))
@@ -281,7 +281,7 @@ def _chain(carrier: Carrier, start_mm: Float, levels: Sequence[LevelSet]) -> lis
     return places
 
 
-def _require_arrival(vertices_mm: Float, level: LevelSet, number: int, phase: float) -> None:
+def require_arrival(vertices_mm: Float, level: LevelSet, number: int, phase: float) -> None:
     """StageError unless the vertices came to lie near the zero level, but for a few."""
     off_mm = distance_off_mm(vertices_mm, level)
     allowed_mm = FARTHEST_VOXELS * level.spacing_mm

@@ -19,6 +19,7 @@ from pipeline.surface.correspondence import (
     carry_through_cycle,
     distance_off_mm,
     drawn_along,
+    require_arrival,
     restore_volume,
     smooth_in_time,
 )
@@ -332,6 +333,9 @@ def _finished(
     places, mended, left = zip(*across(sound, range(len(path_mm))), strict=True)
     moving = MovingSurface(np.stack(places), triangles, phases)
     misfit_ml = _misfit_ml(moving, body.volumes_mm3)
+    for k, vertices_mm in enumerate(moving.vertices_mm):
+        # Smoothing in time may take it off again where labels leap.
+        require_arrival(vertices_mm, body.levels[k], k, phases[k])
     off_mm = map(distance_off_mm, moving.vertices_mm, body.levels)
     far_mm = {k: round(one, 1) for k, one in enumerate(off_mm) if one > body.levels[k].spacing_mm}
     return _Followed(body, moving, sum(mended), sum(left), far_mm, misfit_ml)
