@@ -12,6 +12,15 @@ from data_synth.protocol import MrSettings
 
 LONG_AXIS_VIEWS = ("two_chamber", "three_chamber", "four_chamber")
 
+LEFT, BACK, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+RIGHT, DOWN = (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+SCANNER_AXES = {
+    "transverse": (LEFT, BACK, UP),
+    "sagittal": (BACK, DOWN, RIGHT),
+    "coronal": (LEFT, DOWN, BACK),
+}
+"""Along an image row, down a column, and from slice to slice, as readers expect them."""
+
 
 def tilt(rng: np.random.Generator, settings: MrSettings) -> Float:
     """Rotation (3, 3) by which an operator misses the wanted plane."""
@@ -119,15 +128,24 @@ def plan_volume(
 ) -> tuple[Float, tuple[int, int, int]]:
     """Place an isotropic volume that holds the heart: 4x4 frame, and voxels along (z, y, x).
 
-    Its axes are those of the short-axis stack.
+    Its axes are those of the short-axis stack, or the scanner's.
     """
-    axes = tilt(rng, settings) @ heart.rotation @ np.diag([-1.0, -1.0, 1.0])
-    voxel = settings.volume_voxel_mm
-    low, high = lowest_point(heart) - 8, highest_point(heart) + 6
+    missed, voxel = tilt(rng, settings), settings.volume_voxel_mm
     across = settings.matrix * settings.pixel_mm * 0.75
+    if settings.volume_axes == "short_axis":
+        axes = missed @ heart.rotation @ np.diag([-1.0, -1.0, 1.0])
+        low, high = lowest_point(heart) - 8, highest_point(heart) + 6
+        middle_mm = heart.centre_mm + heart.rotation @ np.array([8.0, 4.0, 0.0])
+    else:
+        axes = missed @ np.array(SCANNER_AXES[settings.volume_axes]).T
+        vertices_mm, _ = heart.surfaces(0.0, ("heart",))["heart"]
+        along_mm = vertices_mm @ axes
+        middle_mm = axes @ (along_mm.min(axis=0) + along_mm.max(axis=0)) / 2
+        reach = np.ptp(along_mm, axis=0) / 2 + 12
+        low, high = -reach[2], reach[2]
+        across = max(across, 2 * float(reach[:2].max()))
     side = math.ceil(across / voxel)
     depth = math.ceil((high - low) / voxel)
-    middle_mm = heart.centre_mm + heart.rotation @ np.array([8.0, 4.0, 0.0])
     half = (side - 1) / 2 * voxel
     corner = middle_mm + axes @ np.array([-half, -half, low])
     return image_frame(axes, corner, (voxel, voxel, voxel)), (depth, side, side)

@@ -65,6 +65,8 @@ class MrSettings(BaseModel):
     """Standard deviation of the heart's place from one slice's breath-hold to another."""
     planning_error_deg: float = Field(default=3.0, ge=0, le=30)
     """Standard deviation of a plane's tilt off where it was meant to be."""
+    volume_axes: Literal["short_axis", "transverse", "sagittal", "coronal"] = "short_axis"
+    """Planes of the isotropic volume: the heart's own, or the scanner's."""
     volume_voxel_mm: float = Field(default=2.0, ge=1, le=5)
     volume_snr: float = Field(default=20.0, gt=0, le=1e9)
     """Like ``snr``, in the isotropic volume."""

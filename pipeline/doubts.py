@@ -45,19 +45,54 @@ UNSURE_MM = 1.0
 """How unsure the walls' places between phases may be, untold: surfaces found in a study of 25
 phases were to 0.3 mm, in one of 10 to 0.8 mm, in one of 6 to 1.5 mm."""
 
+THIN_MM = 4.0
+"""Slices that lie along the left ventricle no farther apart than this are voxels of a volume, as
+good along any axis."""
+
 HARDLY = 0.25
 """Of the other slices' swing: a slice that swings less hardly moves."""
 
 
 def doubts(segment: dict[str, Any], surface: dict[str, Any]) -> list[str]:
     """Sentences on what speaks against labels or times, of the figures of two stages."""
-    of_slices = *low_confidence(segment), *flickering(segment)
+    of_slices = *low_confidence(segment), *blurred(segment), *flickering(segment)
     of_slices = *of_slices, *astray(segment), *out_of_step(segment)
     of_views = disagreeing_views(segment)
     of_surfaces = *unequal_strokes(segment, surface), *odd_systole(surface)
     of_labels = *of_slices, *of_views, *muscle_changes(segment), *odd_ejection(segment)
     of_meshes = *lost_pieces(surface), *off_labels(surface), *misfits(surface)
     return [*of_labels, *of_surfaces, *of_meshes, *crossings(surface)]
+
+
+def reformatted(segment: dict[str, Any]) -> list[str]:
+    """A sentence where slices were drawn across the left ventricle through the cine's own.
+
+    >>> reformatted({"reformatted": {"tilt_deg": 55.2, "step_mm": 2.0}})
+    ['seen in slices drawn across the left ventricle: those of the cine lie 55 degrees off']
+    """
+    if not segment.get("reformatted"):
+        return []
+    return [
+        "seen in slices drawn across the left ventricle: those of the cine lie "
+        f"{segment['reformatted']['tilt_deg']:.0f} degrees off"
+    ]
+
+
+def blurred(segment: dict[str, Any]) -> list[str]:
+    """A sentence where slices were drawn through thick ones.
+
+    >>> blurred({"reformatted": {"tilt_deg": 55.2, "step_mm": 10.0}})
+    ['slices lie along the left ventricle, 10 mm apart: those drawn across it through them are \
+blurred by as much, and breath-holds are not told apart; look at the contours']
+    """
+    step_mm = segment.get("reformatted", {}).get("step_mm", 0.0)
+    if step_mm <= THIN_MM:
+        return []
+    return [
+        f"slices lie along the left ventricle, {step_mm:.0f} mm apart: those drawn across it "
+        "through them are blurred by as much, and breath-holds are not told apart; look at the "
+        "contours"
+    ]
 
 
 def flickering(segment: dict[str, Any]) -> list[str]:
@@ -71,10 +106,11 @@ look at its contours']
     told = sorted(k for k, width in widths.items() if width >= TOLD_FLICKER)
     if not told:
         return []
+    drawn = " drawn across the left ventricle" if segment.get("reformatted") else ""
     return [
-        f"labels of slice {ranges(told)} came and went from phase to phase, and are a mean over "
-        f"{100 * max(widths.values()):.0f} % of the beat; look at {'their' if told[1:] else 'its'} "
-        "contours"
+        f"labels of slice {ranges(told)}{drawn} came and went from phase to phase, and are a mean "
+        f"over {100 * max(widths.values()):.0f} % of the beat; look at "
+        f"{'their' if told[1:] else 'its'} contours"
     ]
 
 

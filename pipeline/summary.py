@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from pipeline.doubts import doubts, few_phases
+from pipeline.doubts import doubts, few_phases, reformatted
 
 LARGEST_DELAY_S = 0.1
 """A scanner stamps its frames later than they are by tens of milliseconds."""
@@ -69,6 +69,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
         *_series_left_out(ingest),
         *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
         *_orientation(segment),
+        *[("heart", text) for text in reformatted(segment)],
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
         *[("cut off", text) for text in cut_sideways_by(segment.get("cut_sideways", {}), ingest)],
         *[("doubtful", text) for text in doubts(segment, figures.get("surface", {}))],

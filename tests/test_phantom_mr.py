@@ -293,6 +293,30 @@ def test_volume_is_isotropic_and_holds_the_heart(heart):
     assert not np.isin(edges, (1, 2, 3, 4, 5)).any()
 
 
+@pytest.mark.parametrize(
+    ("axes", "expected"),
+    [
+        ("transverse", ([1, 0, 0], [0, 1, 0], [0, 0, 1])),
+        ("sagittal", ([0, 1, 0], [0, 0, -1], [-1, 0, 0])),
+        ("coronal", ([1, 0, 0], [0, 0, -1], [0, 1, 0])),
+    ],
+)
+def test_a_volume_in_the_scanners_planes_holds_the_heart(heart, axes, expected):
+    settings = changed(
+        phases=2, volume_axes=axes, volume_voxel_mm=5.0, volume_snr=1e6, through_plane_samples=1,
+        planning_error_deg=0.0,
+    )  # fmt: skip
+    found = acquire_volume(np.random.default_rng(0), heart, [800.0], settings)
+    np.testing.assert_allclose(found.mr_from_index[:3, :3].T / 5.0, expected, atol=1e-12)
+    for k in range(2):
+        counted_ml = (found.labels[k] == 1).sum() * 0.125
+        # A voxel's layer over some 150 cm^2 of wall decides by chance which side it falls on.
+        assert counted_ml == pytest.approx(heart.volumes_ml(k / 2)["lv_endocardium"], rel=0.05)
+    for axis in (1, 2, 3):
+        ends = np.take(found.labels, [0, -1], axis=axis)
+        assert not np.isin(ends, (1, 2, 3, 4, 5)).any()
+
+
 def test_gating_blurs_the_volume_along_the_breathing_axis(heart):
     sharp, blurred = (
         acquire_volume(

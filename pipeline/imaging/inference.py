@@ -283,18 +283,19 @@ def bring_to_one_axis(found: PlaneProbability, cine: Cine) -> bool:
     if cine.moments is None:
         return moved
     for number, z in enumerate(found.view.order):
-        seen = cine.moments[z]
-        if np.abs(seen - phases).max() <= ONE_MOMENT or (np.diff(seen) <= 0).any():
-            continue
         first = number * found.planes_a_slice
         for plane in range(first, first + found.planes_a_slice):
-            _move(found.value[:, plane], seen, phases)
-        moved = True
+            moved |= move_in_time(found.value[:, plane], cine.moments[z], phases)
     return moved
 
 
-def _move(value: Float32, seen: Float, phases: Float) -> None:
-    """Bring what was seen at some phases (``(phase,)`` in [0, 1), rising) to others, in place."""
+def move_in_time(value: Float32, seen: Float, phases: Float) -> bool:
+    """Bring what was seen at some phases (``(phase,)`` in [0, 1)) to others, in place.
+
+    What is less than `ONE_MOMENT` off stays, and where phases do not rise. Whether any was moved.
+    """
+    if np.abs(seen - phases).max() <= ONE_MOMENT or (np.diff(seen) <= 0).any():
+        return False
     count, times = len(seen), np.append(seen, seen[0] + 1)
     place = np.interp((phases - seen[0]) % 1 + seen[0], times, np.arange(count + 1))
     low = np.floor(place).astype(int) % count
@@ -304,6 +305,7 @@ def _move(value: Float32, seen: Float, phases: Float) -> None:
     for phase in np.flatnonzero(~beside_gap):
         one, other = before[low[phase]], before[(low[phase] + 1) % count]
         value[phase] = one + share[phase] * (other - one)
+    return True
 
 
 def _blend(value: Float32, weights: Float32) -> None:

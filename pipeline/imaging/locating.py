@@ -82,7 +82,7 @@ def locate_heart(cine: Cine) -> Found:
         if view is not None:
             break
     else:
-        first, second = _tried(cine)
+        first, second = tried_phases(cine)
         raise StageError(
             f"phases {first} and {second}, slices 0 to {cine.intensity.shape[1] - 1}: no heart "
             f"found: the largest area taken for heart is {largest_mm2:.0f} mm2 over all slices, "
@@ -97,7 +97,7 @@ def locate_heart(cine: Cine) -> Found:
     return Found(view, sought)
 
 
-def _tried(cine: Cine) -> list[int]:
+def tried_phases(cine: Cine) -> list[int]:
     """Phases in which the heart is sought: two that differ, near the beat's start and systole."""
     return [0, max(1, len(cine.intensity) // 3)]
 
@@ -130,7 +130,7 @@ def _seen_in_field(
     The probability of heart; which pixels are cavity that muscle encloses; and by how much grey
     values change between the phases tried.
     """
-    phases = _tried(cine)
+    phases = tried_phases(cine)
     heart, ring, moved = (np.zeros((len(chosen), *view.shape), np.float32) for _ in range(3))
     before: Float32 | None = None
     for phase in phases:
@@ -139,14 +139,14 @@ def _seen_in_field(
         for place, one in enumerate(batch):
             chance = predict(one[None])[0, PLANES // 2]
             heart[place] += (1 - chance[0]) / len(phases)
-            ring[place] += _ringed(chance.argmax(axis=0)) / len(phases)
+            ring[place] += in_a_ring(chance.argmax(axis=0)) / len(phases)
         if before is not None:
             moved = np.abs(batch[:, 1] - before)
         before = batch[:, 1]
     return heart, ring, moved
 
 
-def _ringed(labels: Label) -> Mask:
+def in_a_ring(labels: Label) -> Mask:
     """Left ventricle's cavity where its muscle encloses it, on one slice."""
     muscle = labels == LABELS["lv_myocardium"]
     return np.asarray(ndimage.binary_fill_holes(muscle) & (labels == LABELS["lv_cavity"]))

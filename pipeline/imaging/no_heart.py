@@ -89,14 +89,8 @@ def _numbers(which: Mask) -> str:
     return ", ".join(map(str, np.flatnonzero(which)))
 
 
-def require_understood(
-    drawn: Label, confidence: Float, view: View, settings: SegmentSettings
-) -> None:
-    """Refuse an image that shows no heart between two that do, or that the network doubts.
-
-    A few doubted images beyond the left ventricle, of great vessels or of the belly, are borne:
-    its surfaces do not hang on them.
-    """
+def require_no_gap(drawn: Label, view: View) -> None:
+    """Refuse an image that shows no heart between two that do: it is spoilt."""
     gaps = missed_hearts(drawn, view.pixel_mm)
     if len(gaps):
         phase, number = gaps[0]
@@ -105,6 +99,16 @@ def require_understood(
             "both sides show it; check this image. To do without the slice, draw it between its "
             f"neighbours: cine.spoilt_slices: [{view.order[number]}] in study.yaml"
         )
+
+
+def require_understood(
+    drawn: Label, confidence: Float, view: View, settings: SegmentSettings
+) -> None:
+    """Refuse images that the network doubts.
+
+    A few beyond the left ventricle, of great vessels or of the belly, are borne: its surfaces do
+    not hang on them.
+    """
     low = confidence < settings.min_confidence
     if (low & _shows_left_ventricle(drawn)).any() or low.mean() > MOST_DOUBTED:
         worst = np.unravel_index(confidence.argmin(), confidence.shape)

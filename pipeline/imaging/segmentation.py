@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import ASTRAY_MM, slice_shifts_mm
 from pipeline.imaging.cine import Cine
@@ -14,7 +15,7 @@ from pipeline.imaging.cleanup import clean_cycle
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_room_for_a_heart
-from pipeline.imaging.flicker import settle_flicker
+from pipeline.imaging.flicker import LEAST_MM2, settle_flicker
 from pipeline.imaging.in_step import out_of_step
 from pipeline.imaging.inference import (
     PlaneProbability,
@@ -35,11 +36,20 @@ from pipeline.imaging.lookalikes import (
 )
 from pipeline.imaging.no_heart import (
     require_contrast,
+    require_no_gap,
     require_ring,
     require_understood,
     require_ventricles,
 )
 from pipeline.imaging.plain_blood import settle_plain_blood
+from pipeline.imaging.reformat import (
+    STEP_MM,
+    Reformation,
+    clear_beyond,
+    confidence_on_acquired,
+    labels_on_acquired,
+    reformat_to_short_axis,
+)
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.unrecorded import require_finite
 from pipeline.imaging.view import Orientation, View
@@ -80,6 +90,10 @@ class Segmentation:
     """How the heart was found to lie, against what the file says. All products are in the file's
     frame, whichever it is."""
 
+    reformatted_deg: float | None = None
+    """Where slices do not lie across the left ventricle: angle between their normal and its axis,
+    along which others were drawn through them (`pipeline.imaging.reformat`)."""
+
 
 def segment_cine(
     cine: Cine,
@@ -102,8 +116,30 @@ def segment_cine(
     require_finite(cine, "cine")
     require_room_for_a_heart(cine, "cine")
     require_contrast(cine)
+    through = reformat_to_short_axis(cine)
+    if through is None:
+        return _segment(cine, None, settings, progress, views)
+    try:
+        return _segment(through.cine, through, settings, progress, views)
+    except StageError as error:
+        raise StageError(
+            f"{error}. The cine's slices lie along the left ventricle: those named here are drawn "
+            f"across it through them, {STEP_MM:g} mm apart and counted from the apex"
+        ) from error
+
+
+def _segment(
+    cine: Cine,
+    through: Reformation | None,
+    settings: SegmentSettings,
+    progress: Progress | None,
+    views: Sequence[Cine],
+) -> Segmentation:
+    """Label slices across the left ventricle: a cine's own, or those drawn through a volume."""
     place = locate_heart(cine)
     found = label_probability(cine, place.view, settings.most_views, progress)
+    if through is not None:
+        clear_beyond(found, through.acquired)
     clear_apex(found.value)
     favour_right_ventricle(found.value)
     favour_left_atrium(found.value)
@@ -112,6 +148,8 @@ def segment_cine(
     seen = _drawn(found)
     require_ring(seen, found.view)
     confidence = slice_confidence(cine, found, seen)
+    if through is None:
+        require_no_gap(seen, found.view)
     require_understood(seen, confidence, found.view, settings)
     settle_plain_blood(found, cine)
     flicker = settle_flicker(found.value, cine.phases, found.view.pixel_mm)
@@ -125,26 +163,32 @@ def segment_cine(
     require_ventricles(drawn, found.view, settings)
     crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
     acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
-    labels = _on_cine(found, cine)
+    labels = (
+        _on_cine(found, cine) if through is None else labels_on_acquired(found, through.acquired)
+    )
     if bring_to_one_axis(found, cine):
         drawn = _drawn(found)
     shifts_mm = np.zeros((len(acquired), 3))
     if settings.correct_shifts:
         shifts_mm = _shifts_mm(drawn[:, acquired], acquired, found.view, crossings)
     heart, heart_mr_from_index = _isotropic(found, settings, shifts_mm, acquired)
-    stored = np.argsort(found.view.order)
     numbers = np.asarray(found.view.order)[acquired]
-    apart = out_of_step(drawn[:, acquired], cine.phases, found.view.pixel_mm)
+    if through is None:
+        confidence = confidence[:, np.argsort(found.view.order)]
+        apart = out_of_step(drawn[:, acquired], cine.phases, found.view.pixel_mm)
+    else:
+        confidence, apart = confidence_on_acquired(confidence, found, through.acquired, labels), {}
     return Segmentation(
         labels,
         heart,
         heart_mr_from_index,
-        confidence[:, stored],
+        confidence,
         _astray_mm(shifts_mm, numbers),
-        _flicker_beats(flicker, found),
+        _flicker_beats(flicker, found, drawn),
         {int(numbers[place]): apart[place] for place in sorted(apart, key=lambda k: numbers[k])},
         tuple(crossings.agreement(k) for k in range(len(views))),
         place.orientation,
+        None if through is None else through.tilt_deg,
     )
 
 
@@ -163,12 +207,16 @@ def _astray_mm(shifts_mm: Float, numbers: Integer) -> dict[int, float]:
     }
 
 
-def _flicker_beats(widths_beats: Float, found: PlaneProbability) -> dict[int, float]:
-    """Of each slice, by its number, the widest mean of a ventricle's labels, if any."""
+def _flicker_beats(widths_beats: Float, found: PlaneProbability, drawn: Label) -> dict[int, float]:
+    """Of each slice that shows more than a tip of a ventricle, by its number, the widest mean of
+    such labels, if any."""
     ventricles = [LABELS[name] for name in ("lv_cavity", "lv_myocardium", "rv_cavity")]
+    area_mm2 = np.isin(drawn, ventricles).sum(axis=(2, 3)).max(axis=0) * found.view.pixel_mm**2
     of_ventricles = widths_beats[:, ventricles].max(axis=1)
     widest = of_ventricles.reshape(-1, found.planes_a_slice).max(axis=1)
-    by_number = sorted(zip(found.view.order, widest.tolist(), strict=True))
+    by_number = sorted(
+        zip(found.view.order, np.where(area_mm2 >= LEAST_MM2, widest, 0).tolist(), strict=True)
+    )
     return {number: width for number, width in by_number if width}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline import INTENDED_USE, __version__
-from pipeline.doubts import doubts, few_phases
+from pipeline.doubts import doubts, few_phases, reformatted
 from pipeline.field.fixture import Fixture
 from pipeline.field.manifest import MANIFEST
 from pipeline.field.reader import ForceField
@@ -211,6 +211,7 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
         told.append("No known truth in this study: accuracy against truth was not measured.")
     if doubtful:
         told.append(f"{doubtful} slices are of low confidence in some phase: see Segmentation.")
+    told += [f"The heart was {text}." for text in reformatted(job.figures("segment"))]
     for text in cut_off_by(_cut_off(job, of_field=False), job.figures("ingest")):
         told.append(f"Cut off by the stack's end, and of no fixture: {text}.")
     told.append(f"Made by beatfield {__version__}: of what, the end of the page tells.")

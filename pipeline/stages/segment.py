@@ -43,5 +43,14 @@ def run(job: Job) -> dict[str, Any]:
         "views_agree": {one.name: lines for one, lines in zip(views, found.views, strict=True)},
         "orientation": str(found.orientation),
         "mirror_image": found.orientation.is_mirror_image,
+        "reformatted": _reformatted(found.reformatted_deg, float(cine.spacing_mm[2])),
         "volumes_ml": volumes,
     }
+
+
+def _reformatted(tilt_deg: float | None, step_mm: float) -> dict[str, float]:
+    """How slices lie that others were drawn through: degrees off the left ventricle's axis, and
+    how far apart; empty where they lie across it."""
+    if tilt_deg is None:
+        return {}
+    return {"tilt_deg": round(tilt_deg, 1), "step_mm": round(step_mm, 2)}

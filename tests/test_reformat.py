@@ -1,0 +1,286 @@
+"""Cines that do not lie across the left ventricle, seen in slices that do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from data_synth.mr import MrSettings, acquire_cine, acquire_volume, count_slices
+from data_synth.population import draw_heart
+from pipeline.errors import StageError
+from pipeline.geometry import transform_points
+from pipeline.imaging import reformat, segmentation
+from pipeline.imaging.cine import Cine
+from pipeline.imaging.inference import PlaneProbability
+from pipeline.imaging.labels import LABELS
+from pipeline.imaging.network import CLASSES
+from pipeline.imaging.reformat import (
+    STEP_MM,
+    clear_beyond,
+    confidence_on_acquired,
+    labels_on_acquired,
+    reformat_to_short_axis,
+)
+from pipeline.imaging.segmentation import segment_cine
+from pipeline.imaging.settings import SegmentSettings
+from pipeline.imaging.view import View, canonical_axes
+
+QUICK = SegmentSettings(most_views=1)
+
+VOXEL_MM = 3.0
+
+LEAN_DEG = 25.0
+"""The heart's axis off where it was drawn, towards the level: so it lies in the stout."""
+
+
+def as_cine(made):
+    phases = np.arange(len(made.intensity)) / len(made.intensity)
+    return Cine(made.intensity.astype(np.float32), made.mr_from_index, phases, 0.8)
+
+
+def leaning_heart(seed):
+    heart = draw_heart(np.random.default_rng(seed))
+    across = np.cross(heart.long_axis, [0.0, 0.0, 1.0])
+    turn = Rotation.from_rotvec(-np.deg2rad(LEAN_DEG) * across / np.linalg.norm(across))
+    frame = np.array(heart.mr_from_heart)
+    frame[:3, :3] = turn.as_matrix() @ frame[:3, :3]
+    return replace(heart, mr_from_heart=tuple(map(tuple, frame)))
+
+
+def volume_of(heart, axes, phases=2):
+    settings = MrSettings(
+        phases=phases, volume_axes=axes, volume_voxel_mm=VOXEL_MM, through_plane_samples=4
+    )
+    return acquire_volume(np.random.default_rng(3), heart, [800.0], settings)
+
+
+def angle_deg(one, other):
+    return np.degrees(np.arccos(np.clip(one @ other, -1, 1)))
+
+
+def normal(cine):
+    return canonical_axes(np.cross(cine.mr_from_index[:3, 0], cine.mr_from_index[:3, 1]))[2]
+
+
+def dice(found, truth):
+    return 2 * (found & truth).sum() / max(found.sum() + truth.sum(), 1)
+
+
+@pytest.fixture(scope="module")
+def heart():
+    return leaning_heart(906_001)
+
+
+@pytest.fixture(scope="module")
+def transverse(heart):
+    made = volume_of(heart, "transverse")
+    return as_cine(made), made.labels
+
+
+@pytest.fixture(scope="module")
+def drawn(transverse):
+    return reformat_to_short_axis(transverse[0])
+
+
+@pytest.fixture
+def already_drawn(drawn, monkeypatch):
+    """Looking for the axis takes longer than all else."""
+    monkeypatch.setattr(segmentation, "reformat_to_short_axis", lambda cine: drawn)
+
+
+def test_slices_are_drawn_across_the_left_ventricle_wherever_it_points(heart, transverse, drawn):
+    cine, _ = transverse
+    assert angle_deg(normal(cine), heart.long_axis) > 40
+    # A look that would change the axis by less than this ends the search.
+    assert angle_deg(normal(drawn.cine), heart.long_axis) < reformat.SETTLED_DEG
+    assert drawn.tilt_deg == pytest.approx(angle_deg(normal(cine), heart.long_axis), abs=3)
+    np.testing.assert_allclose(drawn.cine.spacing_mm, (VOXEL_MM, VOXEL_MM, STEP_MM))
+    np.testing.assert_array_equal(drawn.cine.phases, cine.phases)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", ["sagittal", "coronal"])
+@pytest.mark.parametrize("thick", [1, 3])
+def test_so_they_are_through_other_planes_and_thick_slices(axes, thick):
+    heart = leaning_heart(906_002)
+    cine = as_cine(volume_of(heart, axes))
+    frame = cine.mr_from_index.copy()
+    frame[:3, 2] *= thick
+    count = cine.intensity.shape[1] // thick * thick
+    parts = cine.intensity[:, :count].reshape(2, -1, thick, *cine.intensity.shape[2:])
+    found = reformat_to_short_axis(replace(cine, intensity=parts.mean(2), mr_from_index=frame))
+    assert angle_deg(normal(found.cine), heart.long_axis) < reformat.SETTLED_DEG
+
+
+def test_drawn_slices_show_what_was_acquired(transverse, drawn):
+    cine, _ = transverse
+    rng = np.random.default_rng(0)
+    index = np.column_stack([rng.integers(5, n - 5, 2000) for n in cine.intensity.shape[:0:-1]])
+    there = transform_points(
+        np.linalg.inv(drawn.cine.mr_from_index) @ cine.mr_from_index, index.astype(float)
+    )
+    last = np.array(drawn.cine.intensity.shape[:0:-1]) - 1
+    inside = ((there > 1) & (there < last - 1)).all(axis=1)
+    assert inside.sum() > 300
+    nearest = np.rint(there[inside]).astype(int)
+    near = np.abs(nearest - there[inside]).max(axis=1) < 0.25
+    x, y, z = index[inside][near].T
+    u, v, w = nearest[near].T
+    for k in range(2):
+        smooth, seen = (
+            gaussian_filter(one[k], 1.0) for one in (cine.intensity, drawn.cine.intensity)
+        )
+        assert np.corrcoef(smooth[z, y, x], seen[w, v, u])[0, 1] > 0.97
+
+
+def test_labels_come_back_on_the_pixels_that_were_acquired(transverse, already_drawn):
+    cine, truth = transverse
+    found = segment_cine(cine, QUICK)
+    assert found.labels.shape == cine.intensity.shape
+    assert found.confidence.shape == cine.intensity.shape[:2]
+    assert found.reformatted_deg > 40
+    assert (found.confidence > QUICK.min_confidence).all()
+    # What is asked of stacks in short axis, of voxels of half the size and all looks.
+    for name, least in {"lv_cavity": 0.95, "rv_cavity": 0.93, "lv_myocardium": 0.86}.items():
+        value = LABELS[name]
+        for phase in range(2):
+            assert dice(found.labels[phase] == value, truth[phase] == value) >= least, name
+
+
+def test_what_is_wrong_is_told_of_drawn_slices(transverse, already_drawn):
+    with pytest.raises(StageError, match="drawn across it through them, 3 mm apart"):
+        segment_cine(transverse[0], QUICK.model_copy(update={"min_confidence": 0.999}))
+
+
+@pytest.fixture(scope="module")
+def in_short_axis(heart):
+    settings = MrSettings(phases=2, matrix=128, pixel_mm=2.0, through_plane_samples=4)
+    slices = count_slices(heart, settings)
+    return as_cine(acquire_cine(np.random.default_rng(4), heart, [800.0] * slices, settings))
+
+
+def test_slices_across_the_left_ventricle_stay_though_the_file_tells_no_directions(in_short_axis):
+    assert reformat_to_short_axis(in_short_axis) is None
+    lost = np.diag([*in_short_axis.spacing_mm, 1.0])
+    placed_nowhere = replace(in_short_axis, mr_from_index=lost)
+    assert angle_deg(normal(placed_nowhere), reformat.USUAL_AXIS) > reformat.FARTHEST_DEG
+    assert reformat_to_short_axis(placed_nowhere) is None
+    # A part of a stack shows a left ventricle that is wider than long.
+    middle = replace(in_short_axis, intensity=in_short_axis.intensity[:, 2:9], mr_from_index=lost)
+    assert reformat_to_short_axis(middle) is None
+
+
+def test_few_slices_and_far_ones_are_not_looked_at(transverse, monkeypatch):
+    monkeypatch.setattr(reformat, "locate_heart", lambda cine: pytest.fail("looked at"))
+    cine, _ = transverse
+    few = cine.intensity[:, : int(reformat.LEAST_VIEW_MM / VOXEL_MM) - 1]
+    assert reformat_to_short_axis(replace(cine, intensity=few)) is None
+    far = cine.mr_from_index.copy()
+    far[:3, 2] *= 1.01 * reformat.WIDEST_MM / VOXEL_MM
+    assert reformat_to_short_axis(replace(cine, mr_from_index=far)) is None
+
+
+def test_slices_of_beats_of_other_lengths_are_brought_to_one_moment(transverse):
+    """Images that rise with the moment at which they show the heart are alike after it."""
+    cine, _ = transverse
+    phases = np.arange(20) / 20
+    # Systole of a longer beat is a smaller share of it.
+    seen = np.stack([phases**power for power in (1.0, 1.2, 0.8)])
+    wave = np.cos(2 * np.pi * seen)
+    intensity = np.broadcast_to(wave.T[..., None, None], (20, 3, 4, 4)).astype(np.float32)
+    stack = replace(cine, intensity=intensity, phases=phases, moments=seen)
+    brought = reformat._of_one_beat(stack)
+    assert brought.moments is None
+    # Between two phases a line is drawn: off by the second derivative times step squared by 8.
+    widest = np.diff(seen, append=1 + seen[:, :1]).max()
+    off = np.abs(brought.intensity - np.cos(2 * np.pi * phases)[:, None, None, None]).max()
+    assert off <= (2 * np.pi * widest) ** 2 / 8 + 1e-6
+    assert np.abs(wave - wave[0]).max() > 4 * off
+
+
+def planes(axes, corner_mm, shape, count, pixel_mm=2.0, step_mm=3.0):
+    """Planes as the network labels them, all background, and where their pixels are."""
+    frame = np.eye(4)
+    frame[:3, :3] = axes.T * (pixel_mm, pixel_mm, step_mm)
+    frame[:3, 3] = corner_mm
+    view = View(frame, axes, corner_mm, shape, tuple(range(count)), pixel_mm)
+    value = np.zeros((1, count, CLASSES, *shape), np.float32)
+    value[:, :, 0] = 1
+    z, y, x = np.indices((count, *shape), float)
+    return PlaneProbability(value, view, 1), transform_points(frame, np.stack([x, y, z], -1))
+
+
+def acquired_about(middle_mm, shape=(30, 32, 34), spacing_mm=2.5):
+    frame = np.diag([spacing_mm] * 3 + [1.0])
+    frame[:3, 3] = middle_mm - spacing_mm * (np.array(shape[::-1]) - 1) / 2
+    return Cine(np.zeros((1, *shape), np.float32), frame, np.zeros(1), 0.8)
+
+
+AXES = Rotation.from_euler("xyz", [50, -20, 35], degrees=True).as_matrix()
+
+
+def test_nothing_is_labelled_where_nothing_was_acquired():
+    middle_mm = np.array([20.0, -10.0, 5.0])
+    found, points_mm = planes(AXES, middle_mm - AXES.T @ (60, 60, 60), (60, 60), 40)
+    found.value[:, :, 0], found.value[:, :, 1] = 0.1, 0.9
+    cine = acquired_about(middle_mm)
+    clear_beyond(found, cine)
+    half_mm = 2.5 * np.array(cine.intensity.shape[:0:-1]) / 2
+    within = (np.abs(points_mm - middle_mm) <= half_mm).all(axis=-1)
+    assert 0.1 < within.mean() < 0.9
+    np.testing.assert_array_equal(found.value[0, :, 1] > 0.5, within)
+    np.testing.assert_allclose(found.value.sum(axis=2), 1)
+
+
+def test_labels_keep_their_place_between_frames():
+    """A ball labelled in slanted planes is the same ball on the acquired grid."""
+    middle_mm, radius_mm = np.array([20.0, -10.0, 5.0]), 22.0
+    found, points_mm = planes(AXES, middle_mm - AXES.T @ (50, 50, 45), (50, 50), 31)
+    depth_mm = radius_mm - np.linalg.norm(points_mm - middle_mm, axis=-1)
+    found.value[0, :, 3] = np.clip(0.5 + depth_mm / 20, 0, 1)
+    found.value[0, :, 0] = 1 - found.value[0, :, 3]
+    cine = acquired_about(middle_mm + 3)
+    labels = labels_on_acquired(found, cine)
+    z, y, x = np.indices(cine.intensity.shape[1:], float)
+    at_mm = transform_points(cine.mr_from_index, np.stack([x, y, z], -1))
+    off_mm = np.linalg.norm(at_mm - middle_mm, axis=-1) - radius_mm
+    # Chords of 2, 2 and 3 mm leave the ball by their squares over 8 r, which add up.
+    chord_mm = (2**2 + 2**2 + 3**2) / (8 * (radius_mm - 3))
+    np.testing.assert_array_equal(labels[0][off_mm < -chord_mm], 3)
+    np.testing.assert_array_equal(labels[0][off_mm > chord_mm], 0)
+
+
+def test_confidence_of_an_acquired_slice_is_that_of_the_planes_its_heart_lies_on():
+    middle_mm = np.zeros(3)
+    found, _ = planes(AXES, middle_mm - AXES.T @ (50, 50, 45), (50, 50), 31)
+    cine = acquired_about(middle_mm)
+    height_mm = np.arange(31) * 3.0 - 45
+    rising = (0.5 + height_mm / 200)[None]
+    labels = np.zeros(cine.intensity.shape, np.uint8)
+    labels[0, 4, 7, 9] = 1
+    own = confidence_on_acquired(rising, found, cine, labels)
+    assert own.shape == (1, 30)
+    place_mm = transform_points(cine.mr_from_index, np.array([9.0, 7.0, 4.0]))
+    half_a_plane = 1.5 / 200
+    assert own[0, 4] == pytest.approx(0.5 + AXES[2] @ place_mm / 200, abs=half_a_plane)
+    # Elsewhere the mean over a slice, whose middle lies on the axis of the grid.
+    middles_mm = cine.mr_from_index[2, 3] + 2.5 * np.arange(30)
+    expected = 0.5 + AXES[2, 2] * middles_mm / 200
+    np.testing.assert_allclose(np.delete(own[0], 4), np.delete(expected, 4), atol=half_a_plane)
+
+
+def test_a_heart_that_none_of_the_looks_finds_is_left_to_the_slices_own(transverse, monkeypatch):
+    cine, _ = transverse
+    first = reformat._look
+
+    def blind(few, along, acquired=None):
+        if acquired is not None:
+            raise StageError("no heart found")
+        return first(few, along)
+
+    monkeypatch.setattr(reformat, "_look", blind)
+    assert reformat_to_short_axis(cine) is None
+    monkeypatch.setattr(segmentation, "_segment", lambda cine, through, *_: through)
+    assert segment_cine(cine, QUICK) is None
