@@ -1,11 +1,12 @@
 """What the segmenter does with images unlike those it was trained on: tables of Dice.
 
-    python benchmarks/segmentation_robustness.py [OUT] [--seeds 3] [--first 1] [--phases 2] ...
+    python benchmarks/segmentation_robustness.py [OUT] [--seeds 3] [--first 1] [--phases 2]
+        [--ill 8] [--across 8]
 
 Two renderers, side by side: the phantom's own (`data_synth.mr`) and one that shares nothing with
 it (`tests.outside_heart`). First images that show no heart, then both as they are and under the
-same faults, then hearts of the second one at their worst. With OUT, every figure goes into
-OUT/robustness.json as well.
+same faults, then hearts of the second one at their worst, and in slices across the body. With
+no people a part is left out. With OUT, every figure goes into OUT/robustness.json as well.
 """
 
 from __future__ import annotations
@@ -68,8 +69,12 @@ def phantom(seed: int, phases: int, slices: int | None = None) -> Outside:
 
 def outside(seed: int, phases: int, slices: int | None = None, illness: str = "") -> Outside:
     """A heart that shares nothing with the phantom; phase 1 of 3 is near end-systole."""
-    times = (0.0, 0.35) if phases == 2 else tuple((np.arange(phases) / phases).tolist())
-    return render(seed, Scan(times, slices, snr=SNR), illness=illness)
+    return render(seed, Scan(moments(phases), slices, snr=SNR), illness=illness)
+
+
+def moments(phases: int) -> tuple[float, ...]:
+    """End-diastole and about end-systole, or as many phases, evenly spaced."""
+    return (0.0, 0.35) if phases == 2 else tuple((np.arange(phases) / phases).tolist())
 
 
 def inverted(study: Outside) -> Outside:
@@ -292,6 +297,27 @@ def illnesses(seeds: range, phases: int) -> dict[str, list[Outcome]]:
     return found
 
 
+ACROSS = {
+    "volume, voxels of 2.5 mm": {
+        "step_mm": 2.5, "thickness_mm": 2.5, "pixel_mm": 2.5, "depths": 2, "shift_sd_mm": 0.0
+    },
+    "slices of 8 mm": {"step_mm": 8.0},
+}  # fmt: skip
+"""Scans that do not lie across the left ventricle."""
+
+
+def across_the_body(seeds: range, phases: int) -> dict[str, list[Outcome]]:
+    """Hearts from outside in transverse slices; printed as they come."""
+    print_head(f"outside, transverse: Dice mean / worst over {len(seeds)} seeds, {phases} phases")
+    found = {}
+    for title, how in ACROSS.items():
+        scan = Scan(moments(phases), snr=SNR, transverse=True, **how)
+        found[title] = [judge(render(seed, scan)) for seed in seeds]
+        print_row(title, found[title])
+    print_refusals(found)
+    return found
+
+
 def _many_phases(make: Callable[..., Outside], seed: int) -> Outside:
     """The middle of a heart in 60 phases: those of ten times, each shown six times over.
 
@@ -340,14 +366,25 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--phases", type=int, default=2)
-    parser.add_argument("--ill", type=int, default=8, help="people with each illness; 0: none")
+    parser.add_argument("--ill", type=int, default=8, help="people with each illness")
+    parser.add_argument("--across", type=int, default=8, help="people in transverse slices")
     options = parser.parse_args()
     start = time.monotonic()
-    said = no_heart()
-    found = variations(range(options.first, options.first + options.seeds), options.phases)
+    said: dict[str, str] = {}
+    found: dict[str, dict[str, list[Outcome]]] = {}
+
+    def people(count: int) -> range:
+        return range(options.first, options.first + count)
+
+    if options.seeds:
+        said = no_heart()
+        found = variations(people(options.seeds), options.phases)
     if options.ill:
-        found["ill"] = illnesses(range(options.first, options.first + options.ill), options.phases)
-    print_loss(found)
+        found["ill"] = illnesses(people(options.ill), options.phases)
+    if options.across:
+        found["transverse"] = across_the_body(people(options.across), options.phases)
+    if options.seeds:
+        print_loss(found)
     print(f"\n{time.monotonic() - start:.0f} s")
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)

@@ -102,6 +102,9 @@ LEAST_SURROUNDED = 0.5
 FAT_PPM = -3.4
 PROTON_MHZ_PER_T = 42.577
 
+BEYOND_MM = 45.0
+"""Slices across the body reach so far below the ventricle's tip and above the mitral plane."""
+
 OFF_HZ = np.linspace(-200.0, 200.0, 81)
 """Field errors for which signals are worked out."""
 
@@ -113,6 +116,8 @@ class Scan:
     phases: tuple[float, ...] = (0.0, 0.35)
     slices: int | None = None
     """From below the apex; by default as many as reach 12 to 36 mm above the mitral plane."""
+    transverse: bool = False
+    """Slices across the body, from `BEYOND_MM` below the ventricle to as much above it."""
     step_mm: float = 10.0
     thickness_mm: float = 8.0
     pixel_mm: float = 1.5
@@ -226,6 +231,13 @@ def _plan(rng: np.random.Generator, body: Body, scan: Scan) -> tuple[Float, int,
         axes = turn @ axes
     side = round(scan.field_mm / scan.pixel_mm / 2) * 2
     now = left_ventricle(body, 0.0)
+    if scan.transverse:
+        apex_mm = BASE_MM - axes[2] * (now.length + now.wall)
+        height_mm = BASE_MM[2] - apex_mm[2] + 2 * BEYOND_MM
+        frame = np.diag([scan.pixel_mm, scan.pixel_mm, scan.step_mm, 1.0])
+        frame[:3, 3] = (apex_mm + BASE_MM) / 2 - scan.pixel_mm * (side - 1) / 2
+        frame[2, 3] = apex_mm[2] - BEYOND_MM
+        return frame, scan.slices or int(np.ceil(height_mm / scan.step_mm)), side
     low_mm = -now.length - 0.6 * now.wall - rng.uniform(0, 8)
     reach_mm = rng.uniform(12, 36) - low_mm
     off_mm = rng.normal((8, 0), 8)

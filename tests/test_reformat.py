@@ -26,6 +26,7 @@ from pipeline.imaging.reformat import (
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import View, canonical_axes
+from tests.outside_heart import Scan, render
 
 QUICK = SegmentSettings(most_views=1)
 
@@ -104,7 +105,7 @@ def test_slices_are_drawn_across_the_left_ventricle_wherever_it_points(heart, tr
 @pytest.mark.parametrize("axes", ["sagittal", "coronal"])
 @pytest.mark.parametrize("thick", [1, 3])
 def test_so_they_are_through_other_planes_and_thick_slices(axes, thick):
-    heart = leaning_heart(906_002)
+    heart = draw_heart(np.random.default_rng(906_002))
     cine = as_cine(volume_of(heart, axes))
     frame = cine.mr_from_index.copy()
     frame[:3, 2] *= thick
@@ -112,6 +113,20 @@ def test_so_they_are_through_other_planes_and_thick_slices(axes, thick):
     parts = cine.intensity[:, :count].reshape(2, -1, thick, *cine.intensity.shape[2:])
     found = reformat_to_short_axis(replace(cine, intensity=parts.mean(2), mr_from_index=frame))
     assert angle_deg(normal(found.cine), heart.long_axis) < reformat.SETTLED_DEG
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step_mm", [3.0, 8.0])
+@pytest.mark.parametrize("seed", [31, 32])
+def test_people_of_another_renderer_are_labelled_in_slices_across_the_body(seed, step_mm):
+    scan = Scan(step_mm=step_mm, thickness_mm=step_mm, pixel_mm=2.0, depths=2, transverse=True)
+    study = render(seed, scan)
+    found = segment_cine(study.cine, QUICK)
+    assert found.reformatted_deg is not None
+    # Of those in short axis Dice is 0.04 to 0.08 better; muscle is as thick as the slices are far.
+    for name, least in {"lv_cavity": 0.92, "lv_myocardium": 0.8, "rv_cavity": 0.86}.items():
+        value = LABELS[name]
+        assert dice(found.labels == value, study.labels == value) >= least, name
 
 
 def test_drawn_slices_show_what_was_acquired(transverse, drawn):
