@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from pipeline.imaging.settings import LOW_CONFIDENCE
+from pipeline.imaging.settings import LOW_CONFIDENCE, THIN_MM
 
 TOLD_BELOW = 0.7
 """Confidence at which labels are told beside the report, too: of 40 sound studies 2 had less."""
@@ -44,10 +44,6 @@ LEAST_EJECTION = 0.15
 UNSURE_MM = 1.0
 """How unsure the walls' places between phases may be, untold: surfaces found in a study of 25
 phases were to 0.3 mm, in one of 10 to 0.8 mm, in one of 6 to 1.5 mm."""
-
-THIN_MM = 4.0
-"""Slices that lie along the left ventricle no farther apart than this are voxels of a volume, as
-good along any axis."""
 
 HARDLY = 0.25
 """Of the other slices' swing: a slice that swings less hardly moves."""

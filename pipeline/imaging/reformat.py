@@ -36,7 +36,7 @@ that of transverse, sagittal and coronal ones, and of those of files that tell n
 
 ALONG_DEG = 35.0
 """Slices whose normal is nearer to the left ventricle's axis as it shows in them are left as they
-are: by 4 to 5 degrees in short axis, 50 to 75 in slices across the body."""
+are: by up to 13 degrees in short axis, 50 to 75 in slices across the body."""
 
 RINGED = 0.8
 """So are slices in which more of the cavity is ringed by muscle: in short axis 0.9 and more is, in

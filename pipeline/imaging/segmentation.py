@@ -50,7 +50,7 @@ from pipeline.imaging.reformat import (
     labels_on_acquired,
     reformat_to_short_axis,
 )
-from pipeline.imaging.settings import SegmentSettings
+from pipeline.imaging.settings import THIN_MM, SegmentSettings
 from pipeline.imaging.unrecorded import require_finite
 from pipeline.imaging.view import Orientation, View
 from pipeline.progress import Progress
@@ -116,12 +116,23 @@ def segment_cine(
     require_finite(cine, "cine")
     require_room_for_a_heart(cine, "cine")
     require_contrast(cine)
+    refused = None
+    if cine.spacing_mm[2] > THIN_MM:
+        # Slices drawn through thick ones are blurred: the cine's own are better where understood.
+        try:
+            return _segment(cine, None, settings, progress, views)
+        except StageError as error:
+            refused = error
     through = reformat_to_short_axis(cine)
     if through is None:
+        if refused is not None:
+            raise refused
         return _segment(cine, None, settings, progress, views)
     try:
         return _segment(through.cine, through, settings, progress, views)
     except StageError as error:
+        if refused is not None:
+            raise refused from error
         raise StageError(
             f"{error}. The cine's slices lie along the left ventricle: those named here are drawn "
             f"across it through them, {STEP_MM:g} mm apart and counted from the apex"

@@ -6,6 +6,9 @@ from pydantic import Field
 
 from pipeline.validation import Section
 
+THIN_MM = 4.0
+"""Slices no farther apart are those of a volume, through which others can be drawn as good."""
+
 LOW_CONFIDENCE = 0.8
 """Labels of an image that are trusted less are shown as doubtful."""
 
