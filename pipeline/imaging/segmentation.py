@@ -122,7 +122,8 @@ def segment_cine(
         try:
             return _segment(cine, None, settings, progress, views)
         except StageError as error:
-            refused = error
+            # Without its frames, which hold the whole study's probabilities.
+            refused = error.with_traceback(None)
     through = reformat_to_short_axis(cine)
     if through is None:
         if refused is not None:
