@@ -444,13 +444,17 @@ def test_confidence_of_an_acquired_slice_is_that_of_the_planes_its_heart_lies_on
 def test_a_heart_that_none_of_the_looks_finds_is_left_to_the_slices_own(transverse, monkeypatch):
     cine, _ = transverse
     first = reformat._look
-
-    def blind(few, along, acquired=None):
-        if acquired is not None:
-            raise StageError("no heart found")
-        return first(few, along)
-
-    monkeypatch.setattr(reformat, "_look", blind)
+    monkeypatch.setattr(
+        reformat,
+        "_look",
+        lambda few, along, acquired=None: first(few, along) if acquired is None else None,
+    )
     assert reformat_to_short_axis(cine) is None
     monkeypatch.setattr(segmentation, "_segment", lambda cine, through, *_: through)
     assert segment_cine(cine, QUICK) is None
+
+
+def test_images_without_a_heart_are_left_to_be_refused(transverse):
+    cine, _ = transverse
+    noise = np.random.default_rng(1).normal(100, 10, cine.intensity.shape).astype(np.float32)
+    assert reformat_to_short_axis(replace(cine, intensity=noise)) is None

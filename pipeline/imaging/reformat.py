@@ -80,13 +80,8 @@ class Reformation:
 def reformat_to_short_axis(cine: Cine) -> Reformation | None:
     """Slices across the left ventricle, drawn through a cine whose own lie another way.
 
-    None where its own lie across the left ventricle, none drawn through them show it better, or
-    they are too far apart or too few for that.
-
-    Raises
-    ------
-    StageError
-        When no heart is found.
+    None where its own lie across the left ventricle, show none, or are too far apart or too few,
+    and where none drawn through them show it better.
     """
     if _angle_deg(_normal(cine), USUAL_AXIS) < FARTHEST_DEG:
         return None
@@ -95,7 +90,7 @@ def reformat_to_short_axis(cine: Cine) -> Reformation | None:
         return None
     few = _of_two_phases(cine)
     own = _look(_of_few_slices(few), _normal(cine))
-    if own.tilt_deg < ALONG_DEG or own.ringed_mm3 > RINGED * own.cavity_mm3:
+    if own is None or own.tilt_deg < ALONG_DEG or own.ringed_mm3 > RINGED * own.cavity_mm3:
         return None
     best = _best_look(few, own)
     if best is None or best.ringed_mm3 < AS_MUCH * own.ringed_mm3:
@@ -133,18 +128,21 @@ class _Look:
         return _angle_deg(self.along, self.axis)
 
 
-def _look(cine: Cine, along: Float, acquired: Cine | None = None) -> _Look:
-    """Look at slices, drawn through ``acquired`` ones or acquired themselves."""
-    found = label_probability(cine, locate_heart(cine).view, 1)
+def _look(cine: Cine, along: Float, acquired: Cine | None = None) -> _Look | None:
+    """Look at slices, drawn through ``acquired`` ones or acquired themselves; None where they show
+    no left ventricle."""
+    try:
+        place = locate_heart(cine)
+    except StageError:
+        return None
+    found = label_probability(cine, place.view, 1)
     if acquired is not None:
         clear_beyond(found, acquired)
     drawn = np.stack([most_probable(found.at_slices(k)) for k in range(len(found.value))])
     ventricle = _largest_body((drawn == CAVITY) | (drawn == MUSCLE))
     cavity = ventricle & (drawn == CAVITY)
     if cavity.any(axis=0).sum() < 2:
-        raise StageError(
-            "no heart found: slices show no left ventricle; check that the study is a cardiac cine"
-        )
+        return None
     mr_from_planes = _mr_from_planes(found)
     # Of the planes of a slice, labels are those of the middle one.
     mr_from_slices = mr_from_planes.copy()
@@ -189,10 +187,7 @@ def _look_along(few: Cine, axis: Float, own: _Look) -> _Look | None:
     a heart; None where these show none."""
     low_mm, high_mm = _extent_within(few, own.heart_mm, axis, (ASIDE_MM, ASIDE_MM, ASIDE_MM))
     drawn = _drawn_along(few, axis, low_mm, high_mm, (COARSE_MM, COARSE_MM, COARSE_STEP_MM))
-    try:
-        return _look(drawn, axis, few)
-    except StageError:
-        return None
+    return _look(drawn, axis, few)
 
 
 def _of_two_phases(cine: Cine) -> Cine:
