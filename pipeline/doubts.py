@@ -97,6 +97,9 @@ def flickering(segment: dict[str, Any]) -> list[str]:
     >>> flickering({"flicker_beats": {"8": 0.045, "9": 0.1}})
     ['labels of slice 9 came and went from phase to phase, and are a mean over 10 % of the beat; \
 look at its contours']
+    >>> drawn = {"reformatted": {"tilt_deg": 55.0, "step_mm": 2.0}, "flicker_beats": {"8": 0.1}}
+    >>> flickering(drawn)[0][:52]
+    'labels of slice 8 drawn across the left ventricle ca'
     """
     widths = {int(k): width for k, width in segment.get("flicker_beats", {}).items()}
     told = sorted(k for k, width in widths.items() if width >= TOLD_FLICKER)
