@@ -157,7 +157,7 @@ def test_labels_come_back_on_the_pixels_that_were_acquired(transverse, already_d
     assert found.confidence.shape == cine.intensity.shape[:2]
     assert found.reformatted_deg > 40
     assert (found.confidence > QUICK.min_confidence).all()
-    # What is asked of stacks in short axis, of voxels of half the size and all looks.
+    # Of cavities what is asked of stacks in short axis; the muscle is three of these voxels thick.
     for name, least in {"lv_cavity": 0.95, "rv_cavity": 0.93, "lv_myocardium": 0.86}.items():
         value = LABELS[name]
         for phase in range(2):
