@@ -279,7 +279,10 @@ def verify(fields: list[Path], /, *, surfaces: Path | None = None) -> int:
 def _verify(field: Path, surfaces: Path | None) -> None:
     from pipeline.field.verify import certificate_rows, verify_field
 
-    show(f"{field}: {verify_field(field)}")
+    whole = verify_field(field)
+    show(f"{field}: {whole}")
+    for text in whole.doubts:
+        show(f"doubtful  {text}")
     _tell_if_stale(field)
     if surfaces is not None:
         from pipeline.own_surfaces import measure_field

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -327,24 +327,47 @@ def odd_systole(surface: dict[str, Any]) -> list[str]:
     ]
 
 
-def few_phases(accuracy: dict[str, Any]) -> list[str]:
+def few_phases(accuracy: Mapping[str, Any]) -> list[str]:
     """A sentence where phases are too few to tell where the walls are between them.
 
     >>> few_phases({"motion_unsure_p99_mm": 1.54})
     ['between phases: walls may lie 1.5 mm from where the field has them, by what the few phases \
 tell of each other']
+    >>> unknown = {"motion_unsure_p99_mm": None}
+    >>> for errors in ([0], [0, 0], [0, 0, 0]):
+    ...     few_phases(unknown | {"structures": {"heart": {"sign_errors_by_phase": errors}}})
+    []
+    ['between phases: nobody knows where the walls are, for there are but two phases']
+    ['between phases: nobody knows where the walls are, for vertices do not correspond']
     """
     if "motion_unsure_p99_mm" not in accuracy:
         return []
     unsure_mm = accuracy["motion_unsure_p99_mm"]
     if unsure_mm is None:
-        return ["between phases: nobody knows where the walls are, for there are but two phases"]
+        errors = next(iter(accuracy["structures"].values()))["sign_errors_by_phase"]
+        why = "there are but two phases" if len(errors) == 2 else "vertices do not correspond"
+        told = f"between phases: nobody knows where the walls are, for {why}"
+        # One phase is held still.
+        return [told] if len(errors) > 1 else []
     if unsure_mm <= UNSURE_MM:
         return []
     return [
         f"between phases: walls may lie {unsure_mm:.1f} mm from where the field has them, by what "
         "the few phases tell of each other"
     ]
+
+
+def of_registration(register: dict[str, Any]) -> list[str]:
+    """A sentence where a registration is not good.
+
+    >>> of_registration({"verdict": "good", "reason": ""})
+    []
+    >>> of_registration({"verdict": "doubtful", "reason": "expected error 1.9 mm over the heart"})
+    ['registration is doubtful: expected error 1.9 mm over the heart']
+    """
+    if register["verdict"] == "good":
+        return []
+    return [f"registration is {register['verdict']}: {register['reason']}"]
 
 
 def ranges(numbers: Sequence[int]) -> str:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline import INTENDED_USE, __version__
 from pipeline.config import Settings
+from pipeline.doubts import few_phases
 from pipeline.errors import InputError, StageError
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM, certify, require_bounds
@@ -68,6 +69,7 @@ def bake_own_surfaces(
                     "beatfield": __version__,
                     "bake": settings.bake.model_dump(mode="json"),
                 },
+                doubts_of=few_phases,
                 progress=progress,
             )
         except StageError as error:
@@ -82,16 +84,18 @@ def what_was_baked(field: Path) -> list[str]:
     """How exact a field is, and what its fixtures do: some may be defaults that nobody wrote."""
     baked = ForceField.open(field)
     off_mm, about_mm = (baked.accuracy[f"{name}_error_p99_mm"] for name in ("surface", "distance"))
-    return [
+    told = [
         f"phases    {_timing_of(baked)}",
         f"accuracy  {off_mm:.2g} mm off on the surfaces at most and {about_mm:.2g} mm within "
         f"{BAND_MM:g} mm of them, in 99 places of 100",
-    ] + [
+    ]
+    told += [
         f"fixture   {name}: {one.kind.replace('_', ' ')}{f' {one.side}' if one.side else ''} of "
         f"{one.structure}, {one.f_max_n:g} N at most, next to nothing within "
         f"{one.resolved_gamma_mm:.1f} mm, for the {one.device.name}"
         for name, one in baked.fixtures.items()
     ]
+    return told + [f"doubtful  {text}" for text in baked.source["doubts"]]
 
 
 def _timing_of(baked: ForceField) -> str:

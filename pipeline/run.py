@@ -62,7 +62,7 @@ STAGES = (
     ),
     Stage(
         "bake",
-        after=("ingest", "surface", "register"),
+        after=("ingest", "segment", "surface", "register"),
         # Their digests stand in the field.
         inputs=("cine", "mr_ecg", "us"),
         settings=("bake", "fixtures"),

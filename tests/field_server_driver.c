@@ -74,7 +74,7 @@ int main(int count, char **words)
         printf("%s\n", bf_text(status));
         return 3;
     }
-    if (!strcmp(command, "patient")) printf("%s\n", field.patient_id);
+    if (!strcmp(command, "patient")) printf("%s, %d doubts\n", field.patient_id, field.doubts);
     else if (!strcmp(command, "gradients")) printf("%d\n", without_gradients(&field));
     else if (!strcmp(command, "lock")) printf("%d\n", locked(&field, bf_lock(&field)));
     else if (!strcmp(command, "tank")) printf("%d\n", tank_of_nonsense());

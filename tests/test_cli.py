@@ -14,6 +14,7 @@ from data_synth.settings_table import settings_table
 from pipeline.cli import main
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
+from pipeline.field.verify import Report
 from pipeline.summary import summary
 
 
@@ -378,15 +379,16 @@ def test_an_interruption_says_what_is_kept(
 def test_a_bad_field_does_not_hide_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def verified(field: Path) -> str:
+    def verified(field: Path) -> Report:
         if field.name == "good":
-            return "whole"
+            return Report(5, 10**6, 1, "", ("box",), ("a doubt",), ("hold",))
         raise (StageError if field.name == "late" else InputError)(f"{field.name}: cut short")
 
     monkeypatch.setattr("pipeline.field.verify.verify_field", verified)
     assert main(["verify", "bad", "late", "good"]) == 2
     printed, said = capsys.readouterr()
-    assert printed == "good: whole\n"
+    assert printed.startswith("good: whole: 5 files, ")
+    assert printed.endswith("\ndoubtful  a doubt\n")
     assert said == "error: bad: cut short\nerror: late: cut short\n"
     assert main(["verify", "good", "late"]) == 1
     assert main(["verify", "good", "good"]) == 0

@@ -35,7 +35,7 @@ def recorded(folder, **settings):
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     folder = tmp_path_factory.mktemp("served") / "field.zarr"
-    bake_small(folder)
+    bake_small(folder, doubts_of=lambda accuracy: ["walls may lie 2 mm off", "slice 3"])
     return folder
 
 
@@ -52,9 +52,9 @@ def python_server(capsys, *words):
 
 def test_forces_are_those_of_the_heart_at_its_true_phase(tmp_path, path, capsys):
     record, ecg = recorded(tmp_path)
-    code, out, _ = python_server(capsys, path, record, *TIP_MM)
+    code, out, told = python_server(capsys, path, record, *TIP_MM)
     rows = table(out)
-    assert code == 0
+    assert (code, told) == (0, "note: walls may lie 2 mm off\nnote: slice 3\n")
     # A lead's own rhythm must be learnt first; after half the record a regular heart is known.
     late = rows[rows[:, 0] > 10]
     assert late[:, 2].mean() > 0.9
@@ -107,6 +107,7 @@ def test_c_server_renders_the_same_forces(tmp_path, path, program, capsys, setti
     assert main(["rpeaks", str(record), "--out", str(peaks)]) == 0
     words = [str(word) for word in (path, peaks, *TIP_MM)]
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
+    assert done.stderr == f"note: `beatfield verify {path}` tells what speaks against it (2)\n"
     field, table_of_peaks, *point = words
     for given, told in (
         ((field, table_of_peaks, "1O", "0", "0"), b"grid does not hold"),
@@ -158,7 +159,7 @@ def test_a_broken_row_of_peaks_is_told_with_its_line(tmp_path, path, program, ro
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert f"{tmp_path / 'peaks.csv'}, line 3: is no row" in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert done.stderr.count("\n") == 2
     (tmp_path / "peaks.csv").write_text(head + GOOD_ROW.replace("II", '"II, left"').strip())
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     # The header, and the one millisecond at which the beat is known.

@@ -12,6 +12,7 @@ from field_shapes import beating, box, lumpy, sag, sphere
 
 from pipeline.cli import main
 from pipeline.config import Settings
+from pipeline.doubts import few_phases
 from pipeline.errors import InputError, StageError
 from pipeline.exact import ExactSurface, points_about
 from pipeline.field import BakeSettings, Fixture, ForceField
@@ -420,6 +421,19 @@ def test_what_was_baked_is_told_with_the_figures_of_its_certificate(folder, tmp_
     assert told[2].startswith(
         "fixture   hold: guidance of box, 2 N at most, next to nothing within"
     )
+    doubts = ForceField.open(baked).source["doubts"]
+    assert told[3:] == [f"doubtful  {text}" for text in doubts]
+    assert doubts == few_phases(said)
+
+
+def test_a_field_holds_what_is_doubtful_by_its_certificate(tmp_path):
+    def doubts_of(accuracy):
+        return (f"{accuracy['samples_per_phase']} places",)
+
+    for name, given in (("told", doubts_of), ("untold", None)):
+        bake_small(tmp_path / name, source={"shape": "box"}, doubts_of=given)
+    told, untold = (ForceField.open(tmp_path / name).source for name in ("told", "untold"))
+    assert told == untold | {"doubts": ["200 places"]}
 
 
 def test_default_fixtures_stay_and_every_other_surface_is_guided_to():

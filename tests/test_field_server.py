@@ -13,6 +13,7 @@ from field_baked import bake_small
 from field_random import EVEN, ORIGIN_MM, write_random
 from scipy.spatial.transform import Rotation
 
+from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.field import ForceField, files, get_include
 from pipeline.field.manifest import write_manifest
@@ -453,23 +454,30 @@ def test_numbers_are_read_as_python_reads_them(path, program):
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "said", "doubts"),
     [
         (
             {"use": "x", "patient_id": "patient-0007", "inputs": {"patient_id": "no"}},
             "patient-0007",
+            [],
         ),
-        ({"patient_id": "A" * 100}, "A" * 63),
-        ({"shape": "ball"}, ""),
-        ({"patient_id": None}, ""),
-        ({}, ""),
+        ({"patient_id": "A" * 100, "doubts": []}, "A" * 63, []),
+        ({"shape": "ball", "doubts": ["[one]", 'two, "or" not']}, "", ["[one]", 'two, "or" not']),
+        ({"patient_id": None, "doubts": {"a": "b"}, "registration": {"doubts": ["c"]}}, "", []),
+        ({"doubts": "one"}, "", []),
+        ({}, "", []),
     ],
 )
-def test_c_is_told_whose_field_it_is(path, program, tmp_path, source, said):
+def test_c_is_told_whose_field_it_is_and_what_speaks_against_it(
+    path, program, tmp_path, source, said, doubts, capsys
+):
     named = described(path, tmp_path / "f.zarr", source=source)
-    assert run(program, named, "patient").stdout.decode() == f"{said}\n"
+    told = run(program, named, "patient").stdout.decode()
+    assert told == f"{said}, {len(doubts)} doubts\n"
     words = str(verify_field(named))
     assert words.startswith(f"whole, of {source['patient_id']}: " if said else "whole: ")
+    assert main(["verify", str(named)]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [f"doubtful  {text}" for text in doubts]
 
 
 def test_a_tool_of_which_a_number_is_none_is_nowhere(path, program):

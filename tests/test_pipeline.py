@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,15 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from pipeline.cli import main
+from pipeline.config import Settings
 from pipeline.field import ForceField
 from pipeline.geometry import Float
 from pipeline.imaging.nifti import write_image
+from pipeline.job import Job
 from pipeline.products import read_cine
+from pipeline.stages import bake as bake_stage
+from pipeline.study import open_study
+from pipeline.summary import remarks
 
 PHASES = 4
 
@@ -152,6 +158,29 @@ def test_registration_ends_within_three_millimetres_from_ten_off(products: Path)
 def test_the_field_says_what_its_registration_is_worth(products: Path) -> None:
     told = ForceField.open(products / "bake" / "field.zarr").source["registration"]
     assert told["verdict"] in ("good", "doubtful")
+
+
+def test_the_field_says_what_speaks_against_it(
+    work: Path, products: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = ForceField.open(products / "bake" / "field.zarr").source
+    stages = json.loads((products / "run.json").read_text())["stages"]
+    told = [text for word, text in remarks(stages) if word == "doubtful"]
+    good = source["registration"]["verdict"] == "good"
+    assert source["doubts"][: len(told)] == told
+    assert len(source["doubts"]) == len(told) + (not good)
+
+    def baked(*_: object, doubts_of: Callable[[object], list[str]], **__: object) -> object:
+        return doubts_of({"motion_unsure_p99_mm": 1.7})
+
+    monkeypatch.setattr(bake_stage, "bake_field", baked)
+    monkeypatch.setattr(bake_stage, "doubts", lambda _, surface: list(surface["volumes_ml"])[:1])
+    monkeypatch.setattr(bake_stage, "of_registration", lambda found: [found["tracker"]])
+    study = open_study(work / "studies" / "patient-0001")
+    job = Job(study, Settings(), products, products / "bake", lambda done, total: None)
+    of_surfaces, of_registration, between = bake_stage.run(job)["accuracy"]
+    assert (of_surfaces, of_registration) == ("lv_endocardium", source["tracker"])
+    assert between.startswith("between phases: walls may lie 1.7 mm")
 
 
 def at_stored_phase(store: Path, structure: str, phase: int, shape: tuple[int, ...]) -> Float:

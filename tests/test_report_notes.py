@@ -316,7 +316,8 @@ def test_phases_too_few_to_tell_where_walls_are_between_them_are_told():
     assert few_phases({"motion_unsure_p99_mm": 0.9}) == []
     # As of fields of surfaces of one's own that do not correspond, and of older ones.
     assert few_phases({}) == []
-    [said] = few_phases({"motion_unsure_p99_mm": None})
+    two = {"structures": {"epicardium": {"sign_errors_by_phase": [0, 0]}}}
+    [said] = few_phases({"motion_unsure_p99_mm": None, **two})
     assert "nobody knows" in said
     [said] = few_phases({"motion_unsure_p99_mm": 1.26})
     assert "walls may lie 1.3 mm" in said

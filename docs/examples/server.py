@@ -60,7 +60,8 @@ def main(words: list[str]) -> int:
         return 2
     try:
         # Opening reads no values: a damaged one would be a wrong force without a word.
-        verify_field(Path(path))
+        for text in verify_field(Path(path)).doubts:
+            sys.stderr.write(f"note: {text}\n")
         # From memory: no question waits for a disk, or ends with a file that somebody cuts.
         field, tip_mm = ForceField.open(path, in_memory=True), (x_mm, y_mm, z_mm)
         if not field.contains([tip_mm])[0]:

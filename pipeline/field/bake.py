@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,7 @@ def bake_field(
     mr_from_tracker: Float | None = None,
     rr_s: float | None = None,
     source: Mapping[str, Any] | None = None,
+    doubts_of: Callable[[Mapping[str, Any]], Sequence[str]] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Bake distances and potentials of all phases into a new store, and measure it.
@@ -90,6 +91,9 @@ def bake_field(
         Mean duration of a heartbeat, where it is known.
     source
         What the surfaces were made from, to be stored in the field; must be JSON.
+    doubts_of
+        Sentences on what speaks against the field, of its certificate; stored as ``source``'s
+        ``doubts``.
     progress
         Called with (done, total) while phases are baked and measured.
 
@@ -132,7 +136,9 @@ def bake_field(
     metadata = _fit(writer, metadata, chosen, grid, settings.fit_rounds)
     accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
     require_bounds(accuracy, settings.bounds, settings.spacing_mm)
-    writer.finish(metadata.model_copy(update={"accuracy": accuracy}))
+    told = {"doubts": list(doubts_of(accuracy))} if doubts_of else {}
+    told_of = {"accuracy": accuracy, "source": metadata.source | told}
+    writer.finish(metadata.model_copy(update=told_of))
     return accuracy
 
 

@@ -60,6 +60,9 @@ class Report:
     structures: tuple[str, ...]
     """Surfaces whose distances are all finite."""
 
+    doubts: tuple[str, ...]
+    """What the field says that speaks against it, whole as it is: its ``source``'s ``doubts``."""
+
     fixtures: tuple[str, ...]
     """Fixtures whose potential is the formula evaluated on the distance."""
 
@@ -108,9 +111,14 @@ def _verified(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Report:
         bytes=sum(one["size"] for one in files.values()),
         phases=len(metadata.phases),
         patient_id=str(metadata.source.get("patient_id") or ""),
+        doubts=_doubts(metadata.source.get("doubts")),
         structures=tuple(metadata.structures),
         fixtures=tuple(metadata.fixtures),
     )
+
+
+def _doubts(told: Any) -> tuple[str, ...]:
+    return tuple(map(str, told)) if isinstance(told, list) else ()
 
 
 def certificate_rows(accuracy: Mapping[str, Any]) -> list[tuple[str, str]]:

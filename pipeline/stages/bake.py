@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline import INTENDED_USE, __version__
+from pipeline.doubts import doubts, few_phases, of_registration
 from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
 from pipeline.field.certificate import allowed_errors
@@ -40,13 +41,14 @@ def run(job: Job) -> dict[str, Any]:
         "bake": job.settings.bake.model_dump(mode="json"),
         "fingerprint": job.fingerprint,
     }
+    doubted = doubts(job.figures("segment"), job.figures("surface"))
     mr_from_tracker = None
     if registered:
         found = read_table(registered / "mr_from_tracker.json")
         mr_from_tracker = np.array(found["mr_from_tracker"])
         source["tracker"] = found["tracker"]
-        # Who loads the field sees neither the terminal nor the report.
         source["registration"] = {name: found[name] for name in TOLD_OF_REGISTRATION}
+        doubted += of_registration(found)
     certificate = bake_field(
         job.folder / "field.zarr",
         surfaces,
@@ -55,6 +57,8 @@ def run(job: Job) -> dict[str, Any]:
         mr_from_tracker=mr_from_tracker,
         rr_s=timing["rr_s"],
         source=source,
+        # Who loads the field sees neither the terminal nor the report.
+        doubts_of=lambda accuracy: [*doubted, *few_phases(accuracy)],
         progress=job.progress,
     )
     return {

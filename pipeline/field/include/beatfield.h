@@ -90,6 +90,7 @@ typedef struct {
     double *line;        /* four numbers a phase: where which weights hold */
     double rr_s;         /* heartbeat when the images were taken; 0 where unknown */
     char patient_id[BF_NAME]; /* whose field it is; its beginning where longer, empty where not told */
+    int doubts;          /* how many sentences the field has on what speaks against it (beatfield verify) */
     int registered;      /* whether mr_from_tracker is known */
     double mr_from_tracker[16]; /* where it is not known: not numbers, so that no question succeeds */
     int structures, fixtures;
@@ -749,7 +750,12 @@ static void bf__source(bf__json *j, bf_field *field)
     size_t length;
     int first = 1;
     while (bf__key(j, &first, &key, &length)) {
+        int one = 1, counted = bf__is(key, length, "doubts");
         bf__blank(j);
+        if (counted && j->at < j->end && *j->at == '[') {
+            for (field->doubts = 0; bf__item(j, &one); field->doubts++) bf__skip(j, 0);
+            continue;
+        }
         if (!bf__is(key, length, "patient_id") || j->at >= j->end || *j->at != '"') {
             bf__skip(j, 0);
             continue;
