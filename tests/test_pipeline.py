@@ -171,7 +171,8 @@ def test_the_field_says_what_speaks_against_it(
     assert len(source["doubts"]) == len(told) + (not good)
 
     def baked(*_: object, doubts_of: Callable[[object], list[str]], **__: object) -> object:
-        return doubts_of({"motion_unsure_p99_mm": 1.7})
+        parts = {"epicardium": {"sign_errors_by_phase": PHASES * [0]}}
+        return doubts_of({"motion_unsure_p99_mm": 1.7, "structures": parts})
 
     monkeypatch.setattr(bake_stage, "bake_field", baked)
     monkeypatch.setattr(bake_stage, "doubts", lambda _, surface: list(surface["volumes_ml"])[:1])

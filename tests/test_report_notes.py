@@ -312,16 +312,24 @@ def test_figures_of_a_ventricle_that_the_stack_cuts_off_say_so() -> None:
 
 
 def test_phases_too_few_to_tell_where_walls_are_between_them_are_told():
+    def accuracy(unsure_mm: float | None, phases: int) -> dict[str, Any]:
+        parts = {"epicardium": {"sign_errors_by_phase": phases * [0]}}
+        return {"motion_unsure_p99_mm": unsure_mm, "structures": parts}
+
     # Of ten phases walls are unsure by up to 0.8 mm, which is no surprise.
-    assert few_phases({"motion_unsure_p99_mm": 0.9}) == []
-    # As of fields of surfaces of one's own that do not correspond, and of older ones.
+    assert few_phases(accuracy(0.9, 10)) == []
+    # Where no field was baked.
     assert few_phases({}) == []
-    two = {"structures": {"epicardium": {"sign_errors_by_phase": [0, 0]}}}
-    [said] = few_phases({"motion_unsure_p99_mm": None, **two})
+    [said] = few_phases(accuracy(None, 2))
     assert "nobody knows" in said
-    [said] = few_phases({"motion_unsure_p99_mm": 1.26})
+    assert few_phases(accuracy(None, 1)) == []
+    [said] = few_phases(accuracy(0.9, 6))
+    assert "to a millimetre, for there are but 6 phases" in said
+    # What rests does so between phases, too.
+    assert few_phases(accuracy(0.2, 6)) == []
+    [said] = few_phases(accuracy(1.26, 10))
     assert "walls may lie 1.3 mm" in said
-    stages = {"bake": {"status": "done", "figures": {"accuracy": {"motion_unsure_p99_mm": 1.26}}}}
+    stages = {"bake": {"status": "done", "figures": {"accuracy": accuracy(1.26, 10)}}}
     assert ("doubtful", said) in remarks(stages)
     stages["bake"]["status"] = "stale"
     assert remarks(stages) == []
