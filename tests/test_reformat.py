@@ -17,7 +17,7 @@ from pipeline.imaging.inference import PlaneProbability
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.network import CLASSES
 from pipeline.imaging.reformat import (
-    STEP_MM,
+    THIN_STEP_MM,
     clear_beyond,
     confidence_on_acquired,
     labels_on_acquired,
@@ -97,7 +97,7 @@ def test_slices_are_drawn_across_the_left_ventricle_wherever_it_points(heart, tr
     # A look that would change the axis by less than this ends the search.
     assert angle_deg(normal(drawn.cine), heart.long_axis) < reformat.SETTLED_DEG
     assert drawn.tilt_deg == pytest.approx(angle_deg(normal(cine), heart.long_axis), abs=3)
-    np.testing.assert_allclose(drawn.cine.spacing_mm, (VOXEL_MM, VOXEL_MM, STEP_MM))
+    np.testing.assert_allclose(drawn.cine.spacing_mm, (VOXEL_MM, VOXEL_MM, THIN_STEP_MM))
     np.testing.assert_array_equal(drawn.cine.phases, cine.phases)
 
 
@@ -164,9 +164,14 @@ def test_labels_come_back_on_the_pixels_that_were_acquired(transverse, already_d
             assert dice(found.labels[phase] == value, truth[phase] == value) >= least, name
 
 
-def test_what_is_wrong_is_told_of_drawn_slices(transverse, already_drawn):
-    with pytest.raises(StageError, match="drawn across it through them, 3 mm apart"):
-        segment_cine(transverse[0], QUICK.model_copy(update={"min_confidence": 0.999}))
+def test_what_is_wrong_is_told_of_drawn_slices(transverse, already_drawn, monkeypatch):
+    def refused(cine, through, *_):
+        assert cine is through.cine
+        raise StageError("slice 4 is not understood")
+
+    monkeypatch.setattr(segmentation, "_segment", refused)
+    with pytest.raises(StageError, match=r"slice 4 .* drawn across it through them, 2 mm apart"):
+        segment_cine(transverse[0], QUICK)
 
 
 @pytest.mark.parametrize(
@@ -420,6 +425,56 @@ def test_labels_keep_their_place_between_frames():
     chord_mm = (2**2 + 2**2 + 3**2) / (8 * (radius_mm - 3))
     np.testing.assert_array_equal(labels[0][off_mm < -chord_mm], 3)
     np.testing.assert_array_equal(labels[0][off_mm > chord_mm], 0)
+
+
+def test_what_the_slices_show_themselves_is_mixed_in_where_they_reach(monkeypatch):
+    """Probabilities that are straight in space are so wherever they are asked for."""
+    middle_mm, spacing_mm = np.array([20.0, -10.0, 5.0]), 2.5
+    slope = np.array([0.004, -0.003, 0.002])
+
+    def straight(points_mm):
+        return 0.4 + (points_mm - middle_mm) @ slope
+
+    found, points_mm = planes(AXES, middle_mm - AXES.T @ (60, 60, 60), (60, 60), 40)
+    cine = acquired_about(middle_mm)
+    cine = replace(cine, intensity=np.repeat(cine.intensity, 2, axis=0), phases=np.array([0, 0.5]))
+    found = replace(found, value=np.repeat(found.value, 2, axis=0))
+    corner_mm = cine.mr_from_index[:3, 3]
+    own, at_mm = planes(np.eye(3), corner_mm, (32, 34), 30, spacing_mm, spacing_mm)
+    seen = []
+
+    def looked(one, view, most_views):
+        assert view is own.view
+        assert most_views == 1
+        seen.extend(one.phases.tolist())
+        own.value[0, :, 2] = straight(at_mm) * (1 + one.phases[0])
+        own.value[0, :, 0] = 1 - own.value[0, :, 2]
+        return own
+
+    monkeypatch.setattr(reformat, "label_probability", looked)
+    monkeypatch.setattr(reformat, "locate_heart", lambda cine: own)
+    told = []
+    reformat.mix_in_own(found, cine, lambda *done: told.append(done))
+    assert seen == [0, 0.5]
+    assert told == [(1, 2), (2, 2)]
+    reach_mm = spacing_mm * (np.array([34, 32, 30]) - 1) / 2
+    within = (np.abs(points_mm - middle_mm) <= reach_mm).all(axis=-1)
+    assert 0.1 < within.mean() < 0.9
+    for phase, times in enumerate((1, 1.5)):
+        expected = np.where(within, 0.3 * times * straight(points_mm), 0)
+        np.testing.assert_allclose(found.value[phase, :, 2], expected, atol=1e-5)
+        np.testing.assert_allclose(found.value[phase, :, 0], 1 - expected, atol=1e-5)
+        assert not found.value[phase][:, [1, 3, 4, 5, 6]].any()
+
+
+def test_slices_that_show_no_heart_themselves_are_not_mixed_in(monkeypatch):
+    def nowhere(cine):
+        raise StageError("no heart")
+
+    monkeypatch.setattr(reformat, "locate_heart", nowhere)
+    found, _ = planes(AXES, np.zeros(3), (60, 60), 40)
+    reformat.mix_in_own(found, acquired_about(np.zeros(3)))
+    np.testing.assert_array_equal(found.value[:, :, 0], 1)
 
 
 def test_confidence_of_an_acquired_slice_is_that_of_the_planes_its_heart_lies_on():

@@ -25,7 +25,9 @@ from pipeline.imaging.interpolation import class_margins
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 from pipeline.imaging.locating import in_a_ring, locate_heart, tried_phases
 from pipeline.imaging.network import CLASSES
+from pipeline.imaging.settings import THIN_MM
 from pipeline.imaging.view import canonical_axes
+from pipeline.progress import Progress
 
 USUAL_AXIS = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
 """From the apex to the base: right, posterior and up, as in most people lying in the scanner."""
@@ -48,8 +50,16 @@ WIDEST_MM = 12.0
 COARSE_MM, COARSE_STEP_MM = 2.0, 8.0
 """Pixels, and distance of the slices, in which the axis is sought."""
 
-STEP_MM = 3.0
-"""Distance of the slices drawn along the axis found: half the thickness that the network knows."""
+STEP_MM, THIN_STEP_MM = 3.0, 2.0
+"""Distance of the slices drawn along the axis found, half the thickness that the network knows, and
+a third of it where those that they are drawn through are thin, too: by that muscle, atria and right
+ventricle gain 0.002 of Dice."""
+
+OWN_SHARE = 0.3
+"""Of what the acquired slices themselves show, where they are thin, in the mean with slices drawn
+through them: sharper, and seen from another side. Of four phantoms and three people of another
+renderer the right atrium gains 0.004 to 0.010 of Dice, the right ventricle up to 0.005, muscle
+-0.003 to 0.013; at 0.5 the ventricles lose."""
 
 SETTLED_DEG, MOST_LOOKS = 3.0, 4
 """The axis is found when a look would change it by less, or after so many."""
@@ -67,8 +77,8 @@ class Reformation:
     """A cine as slices across the left ventricle."""
 
     cine: Cine
-    """Slices `STEP_MM` apart, from the apex to the base; beyond what was acquired, what is seen at
-    its sides."""
+    """Slices `STEP_MM` or `THIN_STEP_MM` apart, from the apex to the base; beyond what was
+    acquired, what is seen at its sides."""
 
     acquired: Cine
     """As it was given."""
@@ -98,7 +108,7 @@ def reformat_to_short_axis(cine: Cine) -> Reformation | None:
     room_mm = (ASIDE_MM, ASIDE_MM, ALONG_MM)
     low_mm, high_mm = _extent_within(cine, best.heart_mm, best.along, room_mm)
     pixel_mm = float(cine.spacing_mm.min())
-    steps_mm = (pixel_mm, pixel_mm, STEP_MM)
+    steps_mm = (pixel_mm, pixel_mm, THIN_STEP_MM if step_mm <= THIN_MM else STEP_MM)
     across = _drawn_along(_of_one_beat(cine), best.along, low_mm, high_mm, steps_mm)
     return Reformation(across, cine, _angle_deg(own.along, best.along))
 
@@ -303,6 +313,36 @@ def clear_beyond(found: PlaneProbability, acquired: Cine) -> None:
     beyond = np.any((places < -0.5) | (places > last + 0.5), axis=0)
     for plane in range(planes):
         found.value[:, plane, :, beyond[plane]] = np.eye(CLASSES, dtype=np.float32)[0]
+
+
+def mix_in_own(found: PlaneProbability, acquired: Cine, progress: Progress | None = None) -> None:
+    """Take the mean with what thin acquired slices themselves show, in place, where they reach.
+
+    Nothing is mixed in where they show no heart as they are. One phase is in memory at a time;
+    ``progress`` is told of the phases done.
+    """
+    acquired = _of_one_beat(acquired)
+    try:
+        view = locate_heart(acquired).view
+    except StageError:
+        return
+    places = None
+    for phase, drawn in enumerate(found.value):
+        only = slice(phase, phase + 1)
+        one = replace(acquired, intensity=acquired.intensity[only], phases=acquired.phases[only])
+        own = label_probability(one, view, 1)
+        if places is None:
+            places = _places(
+                np.linalg.inv(_mr_from_planes(own)) @ _mr_from_planes(found),
+                (drawn.shape[0], *drawn.shape[2:]),
+            )
+            last = np.array([own.value.shape[k] for k in (1, 3, 4)])[:, None, None, None] - 1
+            share = OWN_SHARE * np.all((places >= 0) & (places <= last), axis=0)
+        for number in range(CLASSES):
+            seen = ndimage.map_coordinates(own.value[0, :, number], places, np.float32, order=1)
+            drawn[:, number] += share * (seen - drawn[:, number])
+        if progress is not None:
+            progress(phase + 1, len(found.value))
 
 
 def labels_on_acquired(found: PlaneProbability, acquired: Cine) -> Label:

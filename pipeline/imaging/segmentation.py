@@ -43,11 +43,11 @@ from pipeline.imaging.no_heart import (
 )
 from pipeline.imaging.plain_blood import settle_plain_blood
 from pipeline.imaging.reformat import (
-    STEP_MM,
     Reformation,
     clear_beyond,
     confidence_on_acquired,
     labels_on_acquired,
+    mix_in_own,
     reformat_to_short_axis,
 )
 from pipeline.imaging.settings import THIN_MM, SegmentSettings
@@ -136,7 +136,8 @@ def segment_cine(
             raise refused from error
         raise StageError(
             f"{error}. The cine's slices lie along the left ventricle: those named here are drawn "
-            f"across it through them, {STEP_MM:g} mm apart and counted from the apex"
+            f"across it through them, {through.cine.spacing_mm[2]:.0f} mm apart and counted from "
+            "the apex"
         ) from error
 
 
@@ -149,9 +150,14 @@ def _segment(
 ) -> Segmentation:
     """Label slices across the left ventricle: a cine's own, or those drawn through a volume."""
     place = locate_heart(cine)
-    found = label_probability(cine, place.view, settings.most_views, progress)
+    # Where slices are drawn through thin ones, these are looked at, too.
+    both = through is not None and through.acquired.spacing_mm[2] <= THIN_MM
+    first = _half(progress, 0) if both else progress
+    found = label_probability(cine, place.view, settings.most_views, first)
     if through is not None:
         clear_beyond(found, through.acquired)
+        if both:
+            mix_in_own(found, through.acquired, _half(progress, 1))
     clear_apex(found.value)
     favour_right_ventricle(found.value)
     favour_left_atrium(found.value)
@@ -202,6 +208,13 @@ def _segment(
         place.orientation,
         None if through is None else through.tilt_deg,
     )
+
+
+def _half(progress: Progress | None, number: int) -> Progress | None:
+    """Of work in two equal halves, who is told of the first (0) or the second (1)."""
+    if progress is None:
+        return None
+    return lambda done, total: progress(number * total + done, 2 * total)
 
 
 def _shifts_mm(drawn: Label, acquired: Integer, view: View, crossings: Crossings) -> Float:
