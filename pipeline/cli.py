@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +21,16 @@ from cyclopts import App, Parameter
 
 from pipeline import __version__
 from pipeline.caches import provide_place
-from pipeline.console import BatchConsole, Console, Whole, say, show, tell, warning_line
+from pipeline.console import (
+    BatchConsole,
+    Console,
+    Whole,
+    in_one_line,
+    say,
+    show,
+    tell,
+    warning_line,
+)
 from pipeline.ending import guarded, hear_signals
 from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
@@ -205,6 +214,11 @@ def batch(
     return 0 if all(one.status in ("done", NO_STUDY) for one in ended.outcomes) else 1
 
 
+def _tell_doubts(doubts: Iterable[str]) -> None:
+    for text in doubts:
+        show(f"doubtful  {in_one_line(text)}")
+
+
 def _tell_if_stale(field: Path) -> None:
     from pipeline.publish import stale_words
 
@@ -258,6 +272,8 @@ def query(
 def verify(fields: list[Path], /, *, surfaces: Path | None = None) -> int:
     """Check baked fields: manifest, sizes, checksums, metadata, finite values.
 
+    What a whole field says that speaks against it is printed, and no failure.
+
     Parameters
     ----------
     fields
@@ -281,8 +297,7 @@ def _verify(field: Path, surfaces: Path | None) -> None:
 
     whole = verify_field(field)
     show(f"{field}: {whole}")
-    for text in whole.doubts:
-        show(f"doubtful  {text}")
+    _tell_doubts(whole.doubts)
     _tell_if_stale(field)
     if surfaces is not None:
         from pipeline.own_surfaces import measure_field
@@ -307,8 +322,12 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
         Folder to write; must not exist.
     """
     from pipeline.field.export import export_field, lost_in
+    from pipeline.field.files import read_metadata
+    from pipeline.field.verify import told_doubts
 
     show(f"exported  {export_field(field, to, out)}")
+    # No other format has room for them.
+    _tell_doubts(told_doubts(read_metadata(field).source))
     _tell_if_stale(field)
     if lost := lost_in(field, to):
         show(f"note      {lost}")

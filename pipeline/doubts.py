@@ -47,7 +47,8 @@ phases were to 0.3 mm, in one of 10 to 0.8 mm, in one of 6 to 3 mm."""
 
 FEW, HINT_MM = 7, 0.25
 """Of fewer phases than so many the epicardia of nine phantoms were 1.2 mm and more off between
-them, in 99 places of 100; how unsure that is said to be is 0.5 mm and more, as phases fall."""
+them, in 99 places of 100, where 0.5 mm and more were told, as phases fell. What moves so little
+that half of that is told is taken to rest."""
 
 HARDLY = 0.25
 """Of the other slices' swing: a slice that swings less hardly moves."""
@@ -363,6 +364,21 @@ tell of each other']
         ]
     few = phases < FEW and unsure_mm > HINT_MM
     return [f"{unknown} to a millimetre, for there are but {phases} phases"] if few else []
+
+
+def odd_orientation(segment: dict[str, Any]) -> list[str]:
+    """A sentence where the heart lies otherwise than the file says.
+
+    >>> odd_orientation({"orientation": "other than the file says: mirrored in the plane"})
+    ["lies other than the file says: mirrored in the plane; check the file's orientation and order \
+of slices"]
+    >>> odd_orientation({"orientation": "as the file says"})
+    []
+    """
+    orientation = segment.get("orientation", "")
+    if not orientation.startswith("other"):
+        return []
+    return [f"lies {orientation}; check the file's orientation and order of slices"]
 
 
 def of_registration(register: dict[str, Any]) -> list[str]:

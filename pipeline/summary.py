@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from pipeline.doubts import doubts, few_phases, reformatted
+from pipeline.doubts import doubts, few_phases, odd_orientation, reformatted
 
 LARGEST_DELAY_S = 0.1
 """A scanner stamps its frames later than they are by tens of milliseconds."""
@@ -68,7 +68,7 @@ def remarks(stages: dict[str, Any]) -> list[tuple[str, str]]:
         *_drawn_between(ingest),
         *_series_left_out(ingest),
         *[("input", text) for text in figures.get("register", {}).get("remarks", [])],
-        *_orientation(segment),
+        *[("heart", text) for text in odd_orientation(segment)],
         *[("heart", text) for text in reformatted(segment)],
         *[("cut off", text) for text in cut_off_by(segment.get("cut_off", {}), ingest)],
         *[("cut off", text) for text in cut_sideways_by(segment.get("cut_sideways", {}), ingest)],
@@ -109,13 +109,6 @@ def series_left_out(ingest: dict[str, Any]) -> list[str]:
     """
     views = tuple(f"{name}:" for name in ingest.get("long_axis", []))
     return [text for text in ingest.get("left_out", []) if not text.startswith(views)]
-
-
-def _orientation(segment: dict[str, Any]) -> list[tuple[str, str]]:
-    orientation = segment.get("orientation", "")
-    if not orientation.startswith("other"):
-        return []
-    return [("heart", f"lies {orientation}; check the file's orientation and order of slices")]
 
 
 def cut_off_by(cut_off: dict[str, dict[Any, int]], ingest: dict[str, Any]) -> list[str]:

@@ -381,14 +381,14 @@ def test_a_bad_field_does_not_hide_the_others(
 ) -> None:
     def verified(field: Path) -> Report:
         if field.name == "good":
-            return Report(5, 10**6, 1, "", ("box",), ("a doubt",), ("hold",))
+            return Report(5, 10**6, 1, "", ("box",), ("hold",), ("a doubt\nof two lines",))
         raise (StageError if field.name == "late" else InputError)(f"{field.name}: cut short")
 
     monkeypatch.setattr("pipeline.field.verify.verify_field", verified)
     assert main(["verify", "bad", "late", "good"]) == 2
     printed, said = capsys.readouterr()
     assert printed.startswith("good: whole: 5 files, ")
-    assert printed.endswith("\ndoubtful  a doubt\n")
+    assert printed.endswith("\ndoubtful  a doubt\\nof two lines\n")
     assert said == "error: bad: cut short\nerror: late: cut short\n"
     assert main(["verify", "good", "late"]) == 1
     assert main(["verify", "good", "good"]) == 0

@@ -107,7 +107,7 @@ def test_c_server_renders_the_same_forces(tmp_path, path, program, capsys, setti
     assert main(["rpeaks", str(record), "--out", str(peaks)]) == 0
     words = [str(word) for word in (path, peaks, *TIP_MM)]
     done = subprocess.run([program, *words], capture_output=True, text=True, check=True)
-    assert done.stderr == f"note: `beatfield verify {path}` tells what speaks against it (2)\n"
+    assert done.stderr == f"note: 2 things speak against {path}; `beatfield verify` prints them\n"
     field, table_of_peaks, *point = words
     for given, told in (
         ((field, table_of_peaks, "1O", "0", "0"), b"grid does not hold"),

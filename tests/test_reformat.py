@@ -1,6 +1,7 @@
 """Cines that do not lie across the left ventricle, seen in slices that do."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from pipeline.imaging.reformat import (
 )
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.imaging.settings import THIN_MM, SegmentSettings
-from pipeline.imaging.view import View, canonical_axes
+from pipeline.imaging.view import AS_THE_FILE_SAYS, Orientation, View, canonical_axes
 from tests.outside_heart import Scan, render
 
 QUICK = SegmentSettings(most_views=1)
@@ -113,6 +114,7 @@ def test_so_they_are_through_other_planes_and_thick_slices(axes, thick):
     parts = cine.intensity[:, :count].reshape(2, -1, thick, *cine.intensity.shape[2:])
     found = reformat_to_short_axis(replace(cine, intensity=parts.mean(2), mr_from_index=frame))
     assert angle_deg(normal(found.cine), heart.long_axis) < reformat.SETTLED_DEG
+    assert found.cine.spacing_mm[2] == pytest.approx(3 if thick > 1 else THIN_STEP_MM)
 
 
 @pytest.mark.slow
@@ -172,6 +174,39 @@ def test_what_is_wrong_is_told_of_drawn_slices(transverse, already_drawn, monkey
     monkeypatch.setattr(segmentation, "_segment", refused)
     with pytest.raises(StageError, match=r"slice 4 .* drawn across it through them, 2 mm apart"):
         segment_cine(transverse[0], QUICK)
+
+
+@pytest.mark.parametrize("thick", [1, 2])
+def test_thin_slices_are_looked_at_beside_those_drawn_through_them(
+    transverse, drawn, monkeypatch, thick
+):
+    """And where nothing was acquired nothing is labelled, whatever they show."""
+    frame = transverse[0].mr_from_index.copy()
+    frame[:3, 2] *= thick
+    through = replace(drawn, acquired=replace(transverse[0], mr_from_index=frame))
+    monkeypatch.setattr(segmentation, "reformat_to_short_axis", lambda cine: through)
+    calls, told = [], []
+
+    def labelled(cine, view, most_views, progress):
+        calls.append("drawn")
+        progress(2, 2)
+        return "found"
+
+    def mixed(found, acquired, orientation, progress):
+        calls.append("own")
+        progress(1, 2)
+
+    def cleared(found, acquired):
+        calls.append("cleared")
+        raise StageError("enough is seen")
+
+    monkeypatch.setattr(segmentation, "label_probability", labelled)
+    monkeypatch.setattr(segmentation, "mix_in_own", mixed)
+    monkeypatch.setattr(segmentation, "clear_beyond", cleared)
+    with pytest.raises(StageError, match="enough is seen"):
+        segment_cine(transverse[0], QUICK, lambda *done: told.append(done))
+    assert calls == (["drawn", "own", "cleared"] if thick == 1 else ["drawn", "cleared"])
+    assert told == ([(2, 4), (3, 4)] if thick == 1 else [(2, 2)])
 
 
 @pytest.mark.parametrize(
@@ -428,8 +463,9 @@ def test_labels_keep_their_place_between_frames():
 
 
 def test_what_the_slices_show_themselves_is_mixed_in_where_they_reach(monkeypatch):
-    """Probabilities that are straight in space are so wherever they are asked for."""
-    middle_mm, spacing_mm = np.array([20.0, -10.0, 5.0]), 2.5
+    """Probabilities that are straight in space are so wherever they are asked for. Slices whose
+    beats were longer are brought to one moment before."""
+    middle_mm = np.array([20.0, -10.0, 5.0])
     slope = np.array([0.004, -0.003, 0.002])
 
     def straight(points_mm):
@@ -437,28 +473,40 @@ def test_what_the_slices_show_themselves_is_mixed_in_where_they_reach(monkeypatc
 
     found, points_mm = planes(AXES, middle_mm - AXES.T @ (60, 60, 60), (60, 60), 40)
     cine = acquired_about(middle_mm)
-    cine = replace(cine, intensity=np.repeat(cine.intensity, 2, axis=0), phases=np.array([0, 0.5]))
+    ramp = np.arange(2, dtype=np.float32)[:, None, None, None] + np.zeros_like(cine.intensity)
+    cine = replace(cine, intensity=ramp, phases=np.array([0, 0.5]), moments=np.zeros((30, 2)))
     found = replace(found, value=np.repeat(found.value, 2, axis=0))
-    corner_mm = cine.mr_from_index[:3, 3]
-    own, at_mm = planes(np.eye(3), corner_mm, (32, 34), 30, spacing_mm, spacing_mm)
+    axes = Rotation.from_euler("xyz", [20, 70, -15], degrees=True).as_matrix()
+    half_mm = np.array([50.0, 40, 52.5])
+    own, at_mm = planes(axes, middle_mm - half_mm @ axes, (41, 51), 36)
     seen = []
 
     def looked(one, view, most_views):
         assert view is own.view
         assert most_views == 1
+        assert one.moments is None
+        assert (one.intensity == 10 + 2 * one.phases[0]).all()
         seen.extend(one.phases.tolist())
         own.value[0, :, 2] = straight(at_mm) * (1 + one.phases[0])
         own.value[0, :, 0] = 1 - own.value[0, :, 2]
         return own
 
     monkeypatch.setattr(reformat, "label_probability", looked)
-    monkeypatch.setattr(reformat, "locate_heart", lambda cine: own)
+
+    def brought(cine):
+        return replace(cine, intensity=cine.intensity + 10, moments=None)
+
+    monkeypatch.setattr(reformat, "_of_one_beat", brought)
+    place = SimpleNamespace(view=own.view, orientation=AS_THE_FILE_SAYS)
+    monkeypatch.setattr(reformat, "locate_heart", lambda cine: place)
     told = []
-    reformat.mix_in_own(found, cine, lambda *done: told.append(done))
+    before = found.value.copy()
+    reformat.mix_in_own(found, cine, Orientation(mirrored=True))
+    np.testing.assert_array_equal(found.value, before)
+    reformat.mix_in_own(found, cine, AS_THE_FILE_SAYS, lambda *done: told.append(done))
     assert seen == [0, 0.5]
     assert told == [(1, 2), (2, 2)]
-    reach_mm = spacing_mm * (np.array([34, 32, 30]) - 1) / 2
-    within = (np.abs(points_mm - middle_mm) <= reach_mm).all(axis=-1)
+    within = (np.abs((points_mm - middle_mm) @ axes.T) <= half_mm).all(axis=-1)
     assert 0.1 < within.mean() < 0.9
     for phase, times in enumerate((1, 1.5)):
         expected = np.where(within, 0.3 * times * straight(points_mm), 0)
@@ -473,7 +521,7 @@ def test_slices_that_show_no_heart_themselves_are_not_mixed_in(monkeypatch):
 
     monkeypatch.setattr(reformat, "locate_heart", nowhere)
     found, _ = planes(AXES, np.zeros(3), (60, 60), 40)
-    reformat.mix_in_own(found, acquired_about(np.zeros(3)))
+    reformat.mix_in_own(found, acquired_about(np.zeros(3)), AS_THE_FILE_SAYS)
     np.testing.assert_array_equal(found.value[:, :, 0], 1)
 
 

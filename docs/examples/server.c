@@ -143,9 +143,9 @@ int main(int count, char **words)
         /* Values in memory before the loop starts, whether they may be locked there or not. */
         status = bf_lock(&field);
         if (status == BF_CANNOT_LOCK) status = BF_OK;
-        if (field.doubts)
-            fprintf(stderr, "note: `beatfield verify %s` tells what speaks against it (%d)\n", words[1],
-                    field.doubts);
+        if (status == BF_OK && field.doubts > 0)
+            fprintf(stderr, "note: %d things speak against %s; `beatfield verify` prints them\n", field.doubts,
+                    words[1]);
         if (status == BF_OK) printf("time_s,phase,valid,fade,x_n,y_n,z_n\n");
         if (status == BF_OK) status = serve(&field, &peaks, tip_mm);
         bf_close(&field);

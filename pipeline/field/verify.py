@@ -60,11 +60,11 @@ class Report:
     structures: tuple[str, ...]
     """Surfaces whose distances are all finite."""
 
-    doubts: tuple[str, ...]
-    """What the field says that speaks against it, whole as it is: its ``source``'s ``doubts``."""
-
     fixtures: tuple[str, ...]
     """Fixtures whose potential is the formula evaluated on the distance."""
+
+    doubts: tuple[str, ...] = ()
+    """What the field says that speaks against it, whole as it is: its ``source``'s ``doubts``."""
 
     def __str__(self) -> str:
         return (
@@ -111,13 +111,15 @@ def _verified(path: Path, files: Mapping[str, Mapping[str, Any]]) -> Report:
         bytes=sum(one["size"] for one in files.values()),
         phases=len(metadata.phases),
         patient_id=str(metadata.source.get("patient_id") or ""),
-        doubts=_doubts(metadata.source.get("doubts")),
         structures=tuple(metadata.structures),
         fixtures=tuple(metadata.fixtures),
+        doubts=told_doubts(metadata.source),
     )
 
 
-def _doubts(told: Any) -> tuple[str, ...]:
+def told_doubts(source: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a field's ``source`` says that speaks against it; nothing where it does not tell."""
+    told = source.get("doubts")
     return tuple(map(str, told)) if isinstance(told, list) else ()
 
 

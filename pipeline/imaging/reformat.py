@@ -26,7 +26,7 @@ from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 from pipeline.imaging.locating import in_a_ring, locate_heart, tried_phases
 from pipeline.imaging.network import CLASSES
 from pipeline.imaging.settings import THIN_MM
-from pipeline.imaging.view import canonical_axes
+from pipeline.imaging.view import Orientation, canonical_axes
 from pipeline.progress import Progress
 
 USUAL_AXIS = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
@@ -315,22 +315,30 @@ def clear_beyond(found: PlaneProbability, acquired: Cine) -> None:
         found.value[:, plane, :, beyond[plane]] = np.eye(CLASSES, dtype=np.float32)[0]
 
 
-def mix_in_own(found: PlaneProbability, acquired: Cine, progress: Progress | None = None) -> None:
-    """Take the mean with what thin acquired slices themselves show, in place, where they reach.
+def mix_in_own(
+    found: PlaneProbability,
+    acquired: Cine,
+    orientation: Orientation,
+    progress: Progress | None = None,
+) -> None:
+    """Take the mean with what thin acquired slices themselves show, in place.
 
-    Nothing is mixed in where they show no heart as they are. One phase is in memory at a time;
+    Nothing is mixed in where they show no heart as they are, or one that lies otherwise than that
+    in the slices drawn through them (``orientation``). One phase is in memory at a time;
     ``progress`` is told of the phases done.
     """
     acquired = _of_one_beat(acquired)
     try:
-        view = locate_heart(acquired).view
+        place = locate_heart(acquired)
     except StageError:
+        return
+    if place.orientation != orientation:
         return
     places = None
     for phase, drawn in enumerate(found.value):
         only = slice(phase, phase + 1)
         one = replace(acquired, intensity=acquired.intensity[only], phases=acquired.phases[only])
-        own = label_probability(one, view, 1)
+        own = label_probability(one, place.view, 1)
         if places is None:
             places = _places(
                 np.linalg.inv(_mr_from_planes(own)) @ _mr_from_planes(found),

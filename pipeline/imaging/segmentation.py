@@ -155,9 +155,9 @@ def _segment(
     first = _half(progress, 0) if both else progress
     found = label_probability(cine, place.view, settings.most_views, first)
     if through is not None:
-        clear_beyond(found, through.acquired)
         if both:
-            mix_in_own(found, through.acquired, _half(progress, 1))
+            mix_in_own(found, through.acquired, place.orientation, _half(progress, 1))
+        clear_beyond(found, through.acquired)
     clear_apex(found.value)
     favour_right_ventricle(found.value)
     favour_left_atrium(found.value)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline import INTENDED_USE, __version__
-from pipeline.doubts import doubts, few_phases, of_registration
+from pipeline.doubts import doubts, few_phases, odd_orientation, of_registration
 from pipeline.errors import InputError
 from pipeline.field.bake import bake_field
 from pipeline.field.certificate import allowed_errors
@@ -41,14 +41,17 @@ def run(job: Job) -> dict[str, Any]:
         "bake": job.settings.bake.model_dump(mode="json"),
         "fingerprint": job.fingerprint,
     }
-    doubted = doubts(job.figures("segment"), job.figures("surface"))
+    segment = job.figures("segment")
+    heart = [f"the heart {text}" for text in odd_orientation(segment)]
+    doubted = [*heart, *doubts(segment, job.figures("surface"))]
+    of_pose: list[str] = []
     mr_from_tracker = None
     if registered:
         found = read_table(registered / "mr_from_tracker.json")
         mr_from_tracker = np.array(found["mr_from_tracker"])
         source["tracker"] = found["tracker"]
         source["registration"] = {name: found[name] for name in TOLD_OF_REGISTRATION}
-        doubted += of_registration(found)
+        of_pose = of_registration(found)
     certificate = bake_field(
         job.folder / "field.zarr",
         surfaces,
@@ -58,7 +61,7 @@ def run(job: Job) -> dict[str, Any]:
         rr_s=timing["rr_s"],
         source=source,
         # Who loads the field sees neither the terminal nor the report.
-        doubts_of=lambda accuracy: [*doubted, *few_phases(accuracy)],
+        doubts_of=lambda accuracy: [*doubted, *few_phases(accuracy), *of_pose],
         progress=job.progress,
     )
     return {

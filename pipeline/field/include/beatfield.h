@@ -90,7 +90,7 @@ typedef struct {
     double *line;        /* four numbers a phase: where which weights hold */
     double rr_s;         /* heartbeat when the images were taken; 0 where unknown */
     char patient_id[BF_NAME]; /* whose field it is; its beginning where longer, empty where not told */
-    int doubts;          /* how many sentences the field has on what speaks against it (beatfield verify) */
+    int doubts;          /* how many sentences on what speaks against it `beatfield verify` prints; -1: not told */
     int registered;      /* whether mr_from_tracker is known */
     double mr_from_tracker[16]; /* where it is not known: not numbers, so that no question succeeds */
     int structures, fixtures;
@@ -750,9 +750,10 @@ static void bf__source(bf__json *j, bf_field *field)
     size_t length;
     int first = 1;
     while (bf__key(j, &first, &key, &length)) {
-        int one = 1, counted = bf__is(key, length, "doubts");
+        int one = 1, told = bf__is(key, length, "doubts");
         bf__blank(j);
-        if (counted && j->at < j->end && *j->at == '[') {
+        if (told) field->doubts = -1;
+        if (told && j->at < j->end && *j->at == '[') {
             for (field->doubts = 0; bf__item(j, &one); field->doubts++) bf__skip(j, 0);
             continue;
         }
@@ -777,6 +778,7 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
     bf_status status;
     memset(field, 0, sizeof *field);
     for (n = 0; n < 16; n++) field->mr_from_tracker[n] = NAN;
+    field->doubts = -1;
     j.at = text;
     j.end = text + length;
     j.bad = 0;
