@@ -26,7 +26,7 @@ from pipeline.imaging.inference import (
 )
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS, most_probable
-from pipeline.imaging.locating import locate_heart
+from pipeline.imaging.locating import Found, locate_heart
 from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
 from pipeline.imaging.lookalikes import (
     clear_apex,
@@ -150,14 +150,7 @@ def _segment(
 ) -> Segmentation:
     """Label slices across the left ventricle: a cine's own, or those drawn through a volume."""
     place = locate_heart(cine)
-    # Where slices are drawn through thin ones, these are looked at, too.
-    both = through is not None and through.acquired.spacing_mm[2] <= THIN_MM
-    first = _half(progress, 0) if both else progress
-    found = label_probability(cine, place.view, settings.most_views, first)
-    if through is not None:
-        if both:
-            mix_in_own(found, through.acquired, place.orientation, _half(progress, 1))
-        clear_beyond(found, through.acquired)
+    found = _looked_at(cine, place, through, settings, progress)
     clear_apex(found.value)
     favour_right_ventricle(found.value)
     favour_left_atrium(found.value)
@@ -208,6 +201,26 @@ def _segment(
         place.orientation,
         None if through is None else through.tilt_deg,
     )
+
+
+def _looked_at(
+    cine: Cine,
+    place: Found,
+    through: Reformation | None,
+    settings: SegmentSettings,
+    progress: Progress | None,
+) -> PlaneProbability:
+    """What the network sees in a cine's slices; where they are drawn through thin ones, in these,
+    too."""
+    if through is None:
+        return label_probability(cine, place.view, settings.most_views, progress)
+    both = through.acquired.spacing_mm[2] <= THIN_MM
+    first = _half(progress, 0) if both else progress
+    found = label_probability(cine, place.view, settings.most_views, first)
+    if both:
+        mix_in_own(found, through.acquired, place.orientation, _half(progress, 1))
+    clear_beyond(found, through.acquired)
+    return found
 
 
 def _half(progress: Progress | None, number: int) -> Progress | None:
