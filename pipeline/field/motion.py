@@ -16,7 +16,7 @@ GAP = 1.5
 LEFT_OUT = ((8, 1.5), (10, 2.0), (np.inf, 3.0))
 """Of fewer phases than so many: a spline misses a place that it was not given by about so many
 times what it misses at most between places that it was given. In 99 places of 100 of four
-structures of six phantoms it was 0.8 to 4.3 times at 3 to 6 phases, 1.1 to 7.6 at 7 to 9, 1.1 to
+structures of six phantoms it was 0.8 to 4.4 times at 3 to 6 phases, 1.1 to 7.6 at 7 to 9, 1.1 to
 5.6 at 10 to 12, and 2.6 and more from 15 on."""
 
 
