@@ -36,6 +36,7 @@ from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import MediaStorageDirectoryStorage
 
 from pipeline.errors import InputError
+from pipeline.imaging.dicom_timing import rr_intervals_ms
 
 AT_ONE_MOMENT = [400.0 + 0.5 * k for k in range(40)]
 
@@ -324,3 +325,22 @@ def test_parts_of_complex_images_in_the_cines_own_series_are_left_out(
     stack = read_dicom_cine(tmp_path)
     assert_is_the_stack(stack)
     assert f"{len(others)} images" in stack.left_out[0]
+
+
+def test_a_frames_own_rr_interval_goes_before_that_of_its_whole_object() -> None:
+    frame, whole = Dataset(), Dataset()
+    frame.RRIntervalTimeNominal, whole.RRIntervalTimeNominal = 800.0, 950.0
+    whole.HeartRate = 60
+    assert rr_intervals_ms(frame, whole) == {"RRIntervalTimeNominal": 800.0, "HeartRate": 1000.0}
+    assert rr_intervals_ms(Dataset(), whole)["RRIntervalTimeNominal"] == 950.0
+
+
+def test_finer_images_in_real_time_are_not_named_as_the_better_stack(tmp_path: Path) -> None:
+    """An image every 0.9 s, of beats of 0.8 s."""
+    others = series([*range(SLICES)], [0.0, 900.0, 1800.0, 2700.0])
+    for data in others:
+        data.PixelSpacing = [value / 2 for value in PIXEL_MM]
+    stack = read_dicom_cine(beside_the_stack(tmp_path, others))
+    assert_is_the_stack(stack)
+    assert stack.remarks == ()
+    assert "many beats in real time" in stack.left_out[0]

@@ -26,7 +26,7 @@ from pipeline.imaging.faults import (
     require_slices_before_phases,
     without_blank_ends,
 )
-from pipeline.imaging.frames import Frame
+from pipeline.imaging.frames import Frame, by_slice, span_beat
 from pipeline.imaging.nifti import read_nifti_cine
 from pipeline.imaging.phases import common_phases, doubts_of_phases
 from pipeline.imaging.stack_choice import choose_stack
@@ -197,6 +197,26 @@ def test_the_darkest_of_what_was_measured_fills_nothing_up() -> None:
     assert without_unrecorded(cine, "the cine") == (cine, ())
 
 
+@pytest.mark.parametrize(("gap", "fills"), [(7.0, False), (14.0, True)])
+def test_what_fills_up_lies_a_tenth_of_the_range_below_the_rest(gap: float, fills: bool) -> None:
+    """Values evenly from 0 to 100 and four of 1000: from the 1st to the 99th percentile 98."""
+    values = np.linspace(0, 100, 2 * 3 * 40 * 40, dtype=np.float32)
+    values = np.random.default_rng(6).permutation(values).reshape(2, 3, 40, 40)
+    values[:, :, :, :4], values[0, 1, 20, 19:23] = -gap, 1000
+    # The darkest of the rest is 0, to a hundredth of the range.
+    cine = Cine(values, STEP_8_MM, np.arange(2) / 2, 0.8)
+    found, told = without_unrecorded(cine, "the cine")
+    assert len(told) == fills
+    assert (found.intensity.min() > -1) == fills
+
+
+def test_of_images_of_two_values_none_fills_up() -> None:
+    images = np.ones((2, 3, 6, 7), np.float32)
+    images[..., :2] = 0
+    cine = Cine(images, STEP_8_MM, np.arange(2) / 2, 0.8)
+    assert without_unrecorded(cine, "the cine") == (cine, ())
+
+
 @pytest.mark.parametrize(
     ("place", "words"),
     [
@@ -279,9 +299,20 @@ def test_phases_sorted_by_name_are_told(phases: int, first: int) -> None:
     images = cine.intensity[np.array(stored) - first]
     (told,) = doubts_of_order(replace(cine, intensity=images))
     assert told.startswith("phases look as if their order were 0 ")
+    # Of both directions of time that which goes on with the lower number.
+    found = [int(number) for number in told.partition(" were ")[2].partition(";")[0].split()]
+    assert sorted(found) == [*range(phases)]
+    assert found[1] < found[-1] or phases < 16
     if phases < 16:
-        order = " ".join(str(stored.index(number)) for number in range(first, first + phases))
-        assert f"were {order};" in told
+        assert found == [stored.index(number) for number in range(first, first + phases)]
+
+
+def test_as_many_slices_as_a_thin_stack_has_are_judged() -> None:
+    cine = beating_ball(phases=3, slices=31)
+    order = [*range(31)]
+    order[3], order[20] = 20, 3
+    (told,) = doubts_of_order(replace(cine, intensity=cine.intensity[:, order]))
+    assert told.startswith("slices look as if their order were 0 1 2 20 4 ")
 
 
 def test_few_phases_in_any_other_order_and_volumes_are_not_judged() -> None:
@@ -644,3 +675,29 @@ def test_a_slice_more_than_half_a_step_off_is_told(off: float, told: bool) -> No
     times_ms[3] += 800 * off
     doubts = doubts_of_phases(times_ms, np.full(100, 800.0), range(100))
     assert [doubt[:19] for doubt in doubts] == ["slice 3 lies 0.022 "] * told
+
+
+def frame_at(along_mm: float, time_ms: float) -> Frame:
+    """An image of 3 rows, 10 mm apart, and 5 columns, 2 mm apart, across the patient's x."""
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    position_mm = np.array([along_mm, 2.0, 3.0])
+    times_ms = {"trigger time": time_ms}
+    return Frame("here", np.zeros((3, 5)), position_mm, axes, (2.0, 10.0), times_ms, 800.0)
+
+
+def test_the_middle_of_an_image_is_halfway_between_its_outer_pixels() -> None:
+    np.testing.assert_allclose(frame_at(1.0, 0).middle_mm, [1, 2 + 4 * 2 / 2, 3 + 2 * 10 / 2])
+
+
+def test_slices_of_a_thin_volume_are_told_apart_and_rounded_places_are_not() -> None:
+    frames = [frame_at(z + off, 0) for z in (0.0, 0.6, 1.2) for off in (0, 0.01)]
+    slices = by_slice(frames)
+    assert [[one.position_mm[0] for one in part] for part in slices] == [
+        [0, 0.01], [0.6, 0.61], [1.2, 1.21],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("last_ms", "spans"), [(64.0, False), (88.0, True)])
+def test_a_beat_is_spanned_by_a_tenth_of_it(last_ms: float, spans: bool) -> None:
+    frames = [frame_at(z, time_ms) for z in (0.0, 8.0, 16.0) for time_ms in (0.0, last_ms)]
+    assert span_beat(frames) == spans

@@ -9,6 +9,7 @@ import pytest
 from cine_files import (
     ALL_FRAMES,
     PHASES,
+    PIXEL_MM,
     RR_MS,
     SLICES,
     assert_is_the_stack,
@@ -54,6 +55,7 @@ def test_images_that_do_not_tell_their_time_are_spread_over_an_rr_interval_that_
     assert_is_the_stack(stack)
     assert stack.timing_source == "study.yaml"
     assert "in the order of their InstanceNumber, evenly" in stack.remarks[0]
+    assert "across it" not in stack.remarks[0]
 
 
 def test_an_rr_interval_of_ones_own_leaves_times_that_files_tell(tmp_path: Path) -> None:
@@ -119,13 +121,13 @@ def test_the_same_images_as_classic_and_enhanced_objects_are_one_beat(tmp_path: 
     assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))
 
 
-@pytest.mark.parametrize("objects", [1, SLICES, PHASES])
+@pytest.mark.parametrize("objects", [1, 2, SLICES, PHASES])
 def test_frames_of_enhanced_objects_are_taken_in_their_order(tmp_path: Path, objects: int) -> None:
     for k in range(objects):
         part = [
             (number, phase)
             for number, phase in ALL_FRAMES
-            if objects == 1 or k == (number if objects == SLICES else phase)
+            if k == {1: 0, 2: phase // 3, SLICES: number, PHASES: phase}[objects]
         ]
         data = enhanced_object(part)
         data.InstanceNumber = k + 1
@@ -164,7 +166,9 @@ def test_of_two_untimed_stacks_of_one_direction_none_is_taken_for_its_number(
     assert_is_the_stack(stack)
 
 
-@pytest.mark.parametrize(("count", "views"), [(PHASES, 1), (4 * PHASES, 0), (2, 0)])
+@pytest.mark.parametrize(
+    ("count", "views"), [(PHASES, 1), (PHASES + 1, 1), (7, 0), (4 * PHASES, 0), (2, 0)]
+)
 def test_what_lies_across_is_spread_where_it_has_as_many_images(
     tmp_path: Path, count: int, views: int
 ) -> None:
@@ -188,3 +192,59 @@ def test_frames_that_tell_their_order_in_time_need_not_be_stored_in_it(tmp_path:
         frame.FrameContentSequence = item(TemporalPositionIndex=phase + 1)
     data.save_as(tmp_path / "all.dcm")
     assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))
+
+
+def plain(count: int, **changes: object) -> list[FileDataset]:
+    """Another stack in the stack's direction, on its matrix but of other pixels."""
+    found = real_time(count)
+    for data in found:
+        for name, value in changes.items():
+            setattr(data, name, value)
+    return found
+
+
+def test_real_time_without_times_beside_a_stack_that_has_them_is_left_as_it_is(
+    tmp_path: Path,
+) -> None:
+    """Spread over a beat it would be the stack, for it has more images."""
+    write_dicom(tmp_path, lambda data, number, phase: bool(in_series(data, 1, "short axis")))
+    for k, data in enumerate(plain(4 * PHASES)):
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    stack = read_dicom_cine(tmp_path, RR_MS)
+    assert_is_the_stack(stack)
+    assert stack.remarks == ()
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_derived_images_of_one_direction_do_not_hinder_the_order(
+    tmp_path: Path, timed: bool
+) -> None:
+    write_dicom(tmp_path, without_times)
+    for k, data in enumerate(plain(PHASES, ImageType=["DERIVED", "SECONDARY", "M"])):
+        if timed:
+            data.TriggerTime = k % PHASES * RR_MS / PHASES
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    stack = read_dicom_cine(tmp_path, RR_MS)
+    assert_is_the_stack(stack)
+    assert len(stack.left_out) == 1
+
+
+def test_what_tells_nearly_one_moment_is_not_spread(tmp_path: Path) -> None:
+    """A map across the stack: as many images, a millisecond apart."""
+    write_dicom(tmp_path, without_times)
+    for k, data in enumerate(real_time(PHASES, across=True)[:PHASES]):
+        data.TriggerTime = 300 + k
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    stack, views = read_dicom_study(tmp_path, RR_MS)
+    assert_is_the_stack(stack)
+    assert views == ()
+    assert "all at nearly one moment of the beat" in stack.left_out[-1]
+
+
+def test_a_stack_that_was_taken_twice_is_not_one_of_twice_as_many_phases(tmp_path: Path) -> None:
+    write_dicom(tmp_path, without_times)
+    for k, data in enumerate(plain(PHASES, PixelSpacing=list(PIXEL_MM))):
+        data.InstanceNumber = 1000 + k
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    with pytest.raises(InputError, match="slices 0 to 3 are given twice: by series 1"):
+        read_dicom_cine(tmp_path, RR_MS)

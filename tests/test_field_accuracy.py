@@ -315,6 +315,14 @@ def test_nothing_is_fitted_where_next_to_nothing_is_off(off_mm):
     assert fit_to_surface(splines, phases, grid, ball, 3) < 1e-20
 
 
+def test_nothing_is_fitted_to_a_surface_beside_the_grid():
+    grid, phases = Grid((20,) * 3, (0.0,) * 3, (1.0,) * 3), np.arange(8) / 8
+    ball = SurfaceSeries((sphere(5.0, 2, (40.0, 9.5, 9.5)),) * 8, phases)
+    splines = list(np.ones((8, 20, 20, 20), np.float32))
+    assert fit_to_surface(splines, phases, grid, ball, 3) == 0
+    assert (np.stack(splines) == 1).all()
+
+
 def test_what_rests_beside_what_moves_is_measured_anew(tmp_path):
     """A field of a resting surface alone has the phases of those beside it."""
     folder = tmp_path / "own"

@@ -112,6 +112,32 @@ def test_directions_and_drift_of_a_ball_are_small(tmp_path):
     in_space = 2 * said["surface_error_max_mm"]
     assert said["drift_max_mm"] < 2 * (2 * np.pi / 12) ** 3 / 24 + in_space
     assert said["drift_max_mm"] > 0
+    # And at the cosine's own places in the middle between phases.
+    field, off_mm = ForceField.open(tmp_path / "f.zarr"), []
+    for moment in phases + 0.5 / 12:
+        ball = sphere(20 + 2 * np.cos(2 * np.pi * moment), 3)
+        asked_mm = [ball.vertices_mm, ball.vertices_mm[ball.triangles].mean(axis=1)]
+        off_mm.append(np.abs(field.distance_mm(np.concatenate(asked_mm), moment)))
+    assert said["drift_p99_mm"] == pytest.approx(np.percentile(off_mm, 99), rel=0.02)
+
+
+def test_the_step_near_the_surface_is_between_nodes_within_two_widths_of_the_law(tmp_path):
+    """Truth: differences between neighbouring nodes by NumPy."""
+    said = bake_small(tmp_path / "f.zarr")["fixtures"]
+    field = ForceField.open(tmp_path / "f.zarr")
+    nodes_mm = field.grid.nodes_mm().reshape(-1, 3)
+    for name, law in FIXTURES.items():
+        largest = 0.0
+        for index, phase in enumerate(field.phases):
+            force_n = field.force_n(nodes_mm, phase, name).reshape(*field.grid.shape, 3)
+            stored = field.stored_distance_mm(law.structure, index)
+            near = np.abs(stored) <= 2 * law.resolved_delta_mm
+            for axis in range(3):
+                step_n = np.linalg.norm(np.diff(force_n, axis=axis), axis=-1)
+                pairs = np.lib.stride_tricks.sliding_window_view(near, 2, axis).all(axis=-1)
+                spacing_mm = field.grid.spacing_mm[2 - axis]
+                largest = max(largest, float(step_n[pairs].max()) / spacing_mm)
+        assert said[name]["force_step_near_surface_n_per_mm"] == pytest.approx(largest, rel=1e-6)
 
 
 def test_a_field_less_exact_than_its_bounds_is_not_published(tmp_path):
@@ -370,6 +396,8 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
     for way_mm, size, words in (
         (0.0, 1.01, r"box, phase 0: 12 triangles around .* ml, not 12 around"),
         (1.0, 1.0, "up to 1.00 mm beside what"),
+        # The grid ends some 16 mm beyond the box.
+        (30.0, 1.0, "box, phase 0: reaches out of the field's grid"),
         (500.0, 1.0, "box, phase 0: reaches out of the field's grid"),
     ):
         other = shutil.copytree(folder, tmp_path / str(way_mm))
@@ -377,6 +405,10 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
         box_mm.save(other / "box_000.vtp")
         with pytest.raises(InputError, match=words):
             measure_field(baked, other)
+    other = shutil.copytree(folder, tmp_path / "finer")
+    pyvista.read(other / "box_000.vtp").subdivide(1).save(other / "box_000.vtp")
+    with pytest.raises(InputError, match=r"box, phase 0: 48 triangles around .* ml, not 12 around"):
+        measure_field(baked, other)
     (folder / "box_002.ply").unlink()
     with pytest.raises(InputError, match="box has 2 files, for 3 phases"):
         measure_field(baked, folder)

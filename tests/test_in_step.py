@@ -151,3 +151,51 @@ def test_nothing_is_told_of_a_slice_that_the_valves_leave_in_systole():
     usual = areas()
     passed = np.where(np.arange(PHASES) % 2, 0.15, 0.9)
     assert told(usual, usual, usual, passed) == {}
+
+
+def wave(amplitude, phases=PHASES):
+    """About 1, of a root mean square of the amplitude over the root of 2."""
+    return 1 + amplitude * np.cos(2 * np.pi * np.arange(phases) / phases)
+
+
+@pytest.mark.parametrize(("rms", "found"), [(0.04, set()), (0.06, {2})])
+def test_a_heart_beats_enough_to_be_judged_where_it_swings_by_a_twentieth(rms, found):
+    usual = wave(np.sqrt(2) * rms)
+    assert set(told(usual, usual, 2 - usual, usual)) == found
+
+
+@pytest.mark.parametrize(("share", "is_told"), [(0.0, True), (0.17, True), (0.35, False)])
+def test_a_slice_makes_at_least_a_quarter_of_the_usual_swing(share, is_told):
+    usual = wave(0.35)
+    found = told(usual, usual, 0.9 * (1 + share * (usual - 1)), usual)
+    assert set(found) == ({2} if is_told else set())
+    if is_told:
+        # A disc's pixels are its area to some 1 %, a thirtieth of the usual swing.
+        assert found[2]["in_step"] == pytest.approx(share, abs=0.03)
+
+
+def test_a_slice_that_rests_is_told_where_the_others_radii_swing_by_half_a_millimetre():
+    """By half the area's share of 0.053, so radii of 24 mm by 0.64 mm and of 16 mm by 0.42 mm."""
+    usual = wave(np.sqrt(2) * 0.053)
+    assert set(told(usual, usual, np.ones(PHASES), usual)) == {2}
+    assert told(usual, usual, np.full(PHASES, (16 / 24) ** 2), usual) == {}
+
+
+def test_a_slice_that_beats_a_little_otherwise_is_judged_by_what_is_left_of_it():
+    """A third of the usual swing, and a second harmonic as large: it correlates by 0.7, but its
+    radius of 15 mm departs from its own share by 0.4 mm alone."""
+    t = np.arange(PHASES) / PHASES
+    usual = wave(0.25)
+    other = 0.4 * (1 + 0.08 * np.cos(2 * np.pi * t) + 0.07 * np.cos(4 * np.pi * t))
+    assert told(usual, usual, other, usual, usual) == {}
+
+
+def test_a_slice_that_correlates_well_is_in_step_though_its_radius_departs():
+    """A twentieth of a beat late: the cosine of 18 degrees is 0.95; radii are 1.2 mm off."""
+    usual = wave(0.45)
+    assert told(usual, usual, np.roll(usual, 1), usual) == {}
+
+
+def test_a_slice_of_a_third_of_the_largest_area_is_judged():
+    usual = areas(share=0.4)
+    assert set(told(usual, usual, 0.5 * np.roll(usual, 8), usual)) == {2}

@@ -71,7 +71,8 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     add_view(tmp_path, 1, FrameOfReferenceUID="1.2.4")
     add_view(tmp_path, 2, moments=1, FrameOfReferenceUID="1.2.3", ImagePositionPatient=[9, 9, 9])
     add_view(tmp_path, 3, FrameOfReferenceUID="1.2.3", ImageOrientationPatient=LEANING)
-    add_view(tmp_path, 4, ImageType=["DERIVED", "SECONDARY"], FrameOfReferenceUID="1.2.3")
+    derived = {"ImageType": ["DERIVED", "SECONDARY"], "PixelData": pixel_value(7, 3).tobytes()}
+    add_view(tmp_path, 4, FrameOfReferenceUID="1.2.3", **derived)
     stack, views = read_dicom_study(tmp_path)
     assert [view.name for view in views] == ['series 50 "view 0"']
     view = views[0].cine
@@ -89,6 +90,8 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     ("every", "third", "words"),
     [
         ({}, {"TriggerTime": 1000.5}, r"its trigger times, from 0 to 1000.5 ms, do not fit in its"),
+        # The next R peak is the first moment of the next beat.
+        ({}, {"TriggerTime": 1000}, "its trigger times, from 0 to 1000 ms, do not fit in its RR"),
         ({}, {"TriggerTime": -3}, "its trigger times, from -3 to "),
         ({}, {"TriggerTime": ""}, "it has no trigger times"),
         ({}, {"NominalInterval": 0}, "it has no RR interval; cine.rr_ms in study.yaml gives one"),
@@ -107,6 +110,33 @@ def test_a_cine_across_the_stack_that_is_no_view_is_told_with_the_reason(
     stack, views = read_dicom_study(tmp_path)
     assert views == ()
     assert stack.left_out[-1].startswith(f'series 50 "view 0": no long-axis view: {words}')
+
+
+@pytest.mark.parametrize(("rr_ms", "views"), [(1400, 1), (1800, 0)])
+def test_a_view_spans_a_tenth_of_its_beat(tmp_path: Path, rr_ms: int, views: int) -> None:
+    """Two moments 160 ms apart."""
+    write_dicom(tmp_path)
+    add_view(tmp_path, 0, moments=2, NominalInterval=rr_ms)
+    stack, found = read_dicom_study(tmp_path)
+    assert len(found) == views
+    assert stack.left_out[-1].endswith("all at nearly one moment of the beat, 0 to 160 ms") == (
+        not views
+    )
+
+
+@pytest.mark.parametrize(("study", "views"), [("1.2.7", 1), ("1.2.8", 0)])
+def test_a_view_without_a_frame_of_reference_is_of_the_stacks_examination(
+    tmp_path: Path, study: str, views: int
+) -> None:
+    def change(data: Any, number: int, phase: int) -> bool:
+        data.FrameOfReferenceUID, data.StudyInstanceUID = "1.2.3", "1.2.7"
+        return True
+
+    write_dicom(tmp_path, change)
+    add_view(tmp_path, 0, StudyInstanceUID=study)
+    stack, found = read_dicom_study(tmp_path)
+    assert len(found) == views
+    assert ("or none and another StudyInstanceUID" in stack.left_out[-1]) == (not views)
 
 
 def test_a_series_of_two_images_at_each_time_is_no_view(tmp_path: Path) -> None:
@@ -186,6 +216,19 @@ def test_a_view_taken_again_is_another_and_its_copy_is_none(tmp_path: Path) -> N
     assert [len(view.cine.phases) for view in views] == [PHASES, PHASES]
     assert [view.cine.rr_s for view in views] == [1.0, 0.9]
     assert (views[1].cine.intensity == 7).all()
+
+
+def test_a_view_taken_again_at_moments_between_the_first_ones_is_another(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    for again in range(2):
+        for phase in range(PHASES):
+            data = in_series(dicom_frame(0, phase), 50 + again, f"view {again}")
+            data.ImageOrientationPatient = ACROSS
+            data.TriggerTime = float(data.TriggerTime) + 20 * again
+            data.PixelData = pixel_value(phase, 2 * again).tobytes()
+            data.save_as(tmp_path / f"view_{again}_{phase}.dcm")
+    _, views = read_dicom_study(tmp_path)
+    assert [len(view.cine.phases) for view in views] == [PHASES, PHASES]
 
 
 @pytest.mark.parametrize("at_a_time", [1, 2, 3])

@@ -345,6 +345,27 @@ def test_a_stack_that_ends_too_soon_is_known_by_its_last_cuts(radii, found):
     assert cut_off(both) == found | others
 
 
+@pytest.mark.parametrize(
+    ("ends", "found"),
+    [
+        # Three quarters of the cut before, in a seventh and a twelfth of the largest one.
+        ([(20, 15)], {7: 1}),
+        ([(12, 9)], {}),
+        # The neighbour's cut counts, not the one before it.
+        ([(60, 45)], {7: 1}),
+        # Hardly smaller in one phase of three; and no more than a tip's, but for noise.
+        ([(60, 57), (60, 30), (60, 30)], {7: 1}),
+        ([(60, 50), (60, 30), (60, 30)], {}),
+    ],
+)
+def test_a_body_goes_on_by_the_share_that_its_last_cut_has_of_the_one_before(ends, found):
+    """Bodies of 100 pixels a slice, but for the last two."""
+    areas = np.array([[0, 100, 100, 100, 100, 100, *end] for end in ends])
+    labels = np.where(np.arange(100) < areas[..., None, None], LABELS["lv_cavity"], 0)
+    expected = {"left ventricle": found} if found else {}
+    assert cut_off(labels.astype(np.uint8)) == expected
+
+
 @pytest.mark.parametrize(("count", "step"), [(3, 2), (2, 4), (5, 2)])
 def test_a_slice_without_neighbours_is_not_unlike_them(count, step):
     """Three slices 5 mm apart: those 9 mm away from the middle one are not there."""
@@ -410,7 +431,7 @@ def test_a_heart_is_missed_between_two_and_not_above_stray_pixels():
 
 
 @pytest.mark.parametrize("blanked", [False, True])
-@pytest.mark.parametrize(("place", "cut"), [(32, False), (11, False), (7, True), (4, True)])
+@pytest.mark.parametrize(("place", "cut"), [(32, False), (9, False), (7, True), (4, True)])
 def test_what_the_images_edge_cuts_off_is_told(blanked, place, cut):
     """A disc of 8 pixels, so far from the edge, in images that end there or are black beyond."""
     rng = np.random.default_rng(0)
@@ -440,6 +461,29 @@ def test_a_dark_lung_at_the_images_side_is_no_edge():
     row, column = np.mgrid[:64, :64]
     labels = np.zeros((8, 3, 64, 64), np.uint8)
     labels[:, 1, np.hypot(row - 32, column - 28) < 8] = LABELS["rv_cavity"]
+    assert cut_sideways(labels, intensity) == {}
+
+
+def test_a_lung_of_noise_by_single_greys_is_no_edge():
+    """Two pixels of five rest at 0; the others differ by 1 between phases, of some 150 in all."""
+    rng = np.random.default_rng(0)
+    intensity = rng.rayleigh(50.0, (8, 3, 64, 64)).astype(np.float32)
+    for lung in (intensity[..., :20], intensity[..., 54:]):
+        lung[:] = rng.random(lung.shape) < 0.1
+    row, column = np.mgrid[:64, :64]
+    labels = np.zeros((8, 3, 64, 64), np.uint8)
+    labels[:, 1, np.hypot(row - 32, column - 28) < 8] = LABELS["rv_cavity"]
+    assert cut_sideways(labels, intensity) == {}
+
+
+def test_what_is_darker_than_the_fill_is_recorded():
+    """Bright padding about a dark image, of what rests and has no noise."""
+    rng = np.random.default_rng(0)
+    intensity = np.tile(rng.uniform(0, 150, (3, 64, 64)).astype(np.float32), (4, 1, 1, 1))
+    intensity[..., :20] = 200
+    row, column = np.mgrid[:64, :64]
+    labels = np.zeros((4, 3, 64, 64), np.uint8)
+    labels[:, 1, np.hypot(row - 32, column - 31) < 8] = LABELS["rv_cavity"]
     assert cut_sideways(labels, intensity) == {}
 
 

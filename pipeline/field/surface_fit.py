@@ -100,7 +100,8 @@ def fit_to_surface(
     moving
         The surface, LPS mm.
     rounds
-        How often the weights of the points are set; nothing is changed when 0.
+        How often the weights of the points are set; nothing is changed when 0, nor where no point
+        of the surface lies in the grid.
     threads
         How many; as many as there are processors when None.
 
@@ -113,6 +114,8 @@ def fit_to_surface(
     places = [one.inside(grid) for one in _places(moving, phases, grid)]
     # Between phases that lie close together a spline may carry all points out of the grid.
     places = [one for one in places if len(one.points_mm)]
+    if not places:
+        return 0.0
     low, high = _box([one.points_mm for one in places], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     line = timeline(phases)
