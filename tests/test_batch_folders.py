@@ -16,7 +16,7 @@ import pytest
 from batch_program import make_study, rows_of, stand_in
 
 from pipeline.batch_ending import how_it_ended
-from pipeline.batch_plan import plan_batch
+from pipeline.batch_plan import notes_on, plan_batch
 from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.publish import locked
@@ -144,12 +144,31 @@ def test_products_are_not_put_where_they_would_be_taken_for_studies(
     assert sorted(studies.rglob("*")) == before
 
 
+@pytest.mark.parametrize("place", ["", "products"])
+def test_a_link_does_not_hide_that_products_would_lie_among_the_studies(
+    studies: Path, place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    link = studies.parent / "link"
+    link.symlink_to(studies / "good" if place else studies)
+    assert batch(studies, link / place) == 2
+    assert "choose another --out" in capsys.readouterr().err
+
+
+def test_folders_in_which_products_lie_are_none_of_the_studies(studies: Path) -> None:
+    out = studies / "products" / "first"
+    for _ in range(2):
+        assert batch(studies, out) == 0
+        assert rows_of(out).keys() == {"good"}
+
+
 def test_what_belongs_to_no_study_is_told(
     studies: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = studies.parent / "out"
     (out / "last-year").mkdir(parents=True)
     (out / "last-year" / "run.json").write_text("{}")
+    # A folder of that name that is no study has no products.
+    (studies / "last-year").mkdir()
     (studies / "list.txt").touch()
     (studies / ".hidden").touch()
     assert batch(studies) == 0
@@ -158,13 +177,53 @@ def test_what_belongs_to_no_study_is_told(
     assert notes[1].endswith("holds products that are of no study of this batch: last-year")
 
 
-def test_a_link_that_leads_nowhere_is_a_study_that_failed(studies: Path) -> None:
+def test_of_many_that_belong_to_no_study_the_first_five_are_named(studies: Path) -> None:
+    (studies.parent / "out").mkdir()
+    for name in "abcde":
+        (studies / name).touch()
+    plans = plan_batch(studies, studies.parent / "out")
+    (note,) = notes_on(studies, studies.parent / "out", plans)
+    assert note.endswith(": a, b, c, d, e")
+    (studies / "f").touch()
+    (note,) = notes_on(studies, studies.parent / "out", plans)
+    assert note.endswith(": a, b, c, d, e and 1 more")
+
+
+def test_products_of_a_study_that_can_no_longer_be_opened_are_still_its_own(studies: Path) -> None:
+    """Told by the study that their record names, or else by its folder's name."""
+    out, archive = studies.parent / "out", studies.parent / "archive"
+    make_study(archive / "tenth", "nonsense: 1\n")
+    (studies / "tenth").symlink_to(archive / "tenth")
+    (studies / "good" / "study.yaml").write_text("nonsense: 1\n")
+    for name, record in (("p10", {"study": str(archive.resolve() / "tenth")}), ("good", {})):
+        (out / name).mkdir(parents=True)
+        (out / name / "run.json").write_text(json.dumps(record))
+    assert notes_on(studies, out, plan_batch(studies, out)) == []
+
+
+def test_studies_that_are_gone_when_all_have_run_leave_notes_on_their_products(
+    studies: Path,
+) -> None:
+    out = studies.parent / "out"
+    assert batch(studies) == 0
+    plans = plan_batch(studies, out)
+    studies.rename(studies.parent / "elsewhere")
+    assert notes_on(studies, out, plans) == []
+    (out / "good").rename(out / "other")
+    assert notes_on(studies, out, plans)[0].endswith("no study of this batch: other")
+
+
+def test_a_link_that_leads_nowhere_is_a_study_that_failed(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As of an archive that is not mounted: whoever looks for its row must find one."""
     (studies / "lost").symlink_to("/mnt/nowhere")
     assert batch(studies) == 1
     row = rows_of(studies.parent / "out")["lost"]
     assert row["status"] == "failed"
     assert row["cause"].startswith(f"{studies / 'lost'}: is a link to /mnt/nowhere, where nothing")
+    # And is not told again among the files that are none.
+    assert "not looked at" not in capsys.readouterr().out
 
 
 def test_a_study_is_not_taken_for_a_folder_of_studies(studies: Path) -> None:

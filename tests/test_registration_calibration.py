@@ -20,13 +20,20 @@ from ellipsoid_heart import (
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry import Float, transform_points
-from pipeline.registration.calibration import calibration_of, certainty
+from pipeline.registration.calibration import (
+    _cost,
+    _Expansion,
+    _expansion,
+    calibration_of,
+    certainty,
+)
 from pipeline.registration.correction import Correction, put_right, tracker_from_picture
 from pipeline.registration.frames import Samples, sample_frames
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.search import prepare_search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find
+from pipeline.registration.uncertainty import frame_curvatures
 
 FIXED = RegisterSettings(grid_mm=3.0, sample_spacing_mm=6.0, candidates=1, starts=1)
 PER_SWEEP = FIXED.model_copy(update={"calibration": "per_sweep"})
@@ -285,6 +292,36 @@ def test_a_step_of_the_pose_does_what_that_of_a_correction_does(planes):
         assert np.abs(lifted - moved).max() < 0.02 * np.abs(way_mm).max()
 
 
+def test_slopes_of_the_cost_are_those_of_its_differences(planes):
+    """In all 18 parameters, at corrections that shift. A frame's slopes are told by steps of 1 mm,
+    which at a lever of 45 mm bend by the square of 1 / 45: by less than a thousandth."""
+    calibration, level, pose = planes
+    steps_mm = np.hstack(
+        [np.random.default_rng(0).normal(scale=4.0, size=(2, 3)), np.zeros((2, 3))]
+    )
+    shifted = replace(calibration, steps_mm=steps_mm)
+    placed = shifted.placed(level)
+    derivatives = frame_curvatures(lambda step: placed.losses(shifted.pivot.move(pose, step)))
+    expansion = _expansion(shifted, placed, pose, *derivatives, 0.5)
+
+    def cost(step):
+        moved = replace(shifted, steps_mm=steps_mm + step[6:].reshape(2, 6))
+        return _cost(moved, level, shifted.pivot.move(pose, step[:6]), expansion.worth)
+
+    differences = np.array([cost(way) - cost(-way) for way in 1e-3 * np.eye(18)]) / 2e-3
+    np.testing.assert_allclose(expansion.slope, differences, atol=1e-3 * np.abs(differences).max())
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_step_is_cut_to_three_millimetres_whichever_way_it_goes(way):
+    """The optimum of a bowl of unit bending lies as far off as its slope is steep."""
+    slope = way * np.array([6.0, 1.0, 0.0, 0.0, 2.0, 0.0])
+    step = _Expansion(slope, np.eye(6), np.zeros((6, 6)), 1.0).towards_optimum()
+    np.testing.assert_allclose(step, -slope / 2)
+    near = _Expansion(slope / 3, np.eye(6), np.zeros((6, 6)), 1.0).towards_optimum()
+    np.testing.assert_allclose(near, -slope / 3)
+
+
 def test_a_sweep_that_shows_nothing_is_as_unsure_as_before(surfaces):
     """Its covariance is what was believed; and no other's pose is the worse for it."""
     recording = record(seed=5, frames=12)
@@ -295,6 +332,8 @@ def test_a_sweep_that_shows_nothing_is_as_unsure_as_before(surfaces):
     both = calibration_of([seen, dead], level, search.pivot, PER_SWEEP)
     alone = calibration_of([seen], level, search.pivot, PER_SWEEP)
     opened, corrections = certainty(both, level, recording.mr_from_tracker, PER_SWEEP)
+    rows, columns = dead.images.shape[1:]
+    assert corrections[1].origin_px == (columns // 2, rows // 2)
     np.testing.assert_allclose(
         corrections[1].covariance, np.diag([4.0] * 3 + [np.radians(2.0) ** 2] * 3), rtol=1e-9
     )

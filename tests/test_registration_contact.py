@@ -14,7 +14,7 @@ from data_synth.population import draw_heart
 from data_synth.probe import PROBES
 from data_synth.ultrasound import UltrasoundSettings, simulate_sweeps
 from pipeline.errors import UnregistrableError
-from pipeline.registration.contact import Contact
+from pipeline.registration.contact import Contact, _apex_mm
 from pipeline.registration.frames import sample_frames
 
 LENGTHS_MM = 4.0, 1.5, 20.0
@@ -59,19 +59,28 @@ def test_a_curve_of_grey_changes_nothing():
         assert not contact.touching(255 * (image[None] / 255) ** gamma).any()
 
 
+@pytest.mark.parametrize("pixel_mm", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5)])
 @pytest.mark.parametrize("widening", [0.0, 0.7])
-def test_depth_alone_is_air_and_a_heart_is_not(widening):
+def test_depth_alone_is_air_and_a_heart_is_not(widening, pixel_mm):
     """Parallel beams and a fan; a dark disc of 50 mm beside the middle is a heart."""
-    j, i = np.mgrid[:120, :160]
+    i, j = np.meshgrid(np.arange(0, 160, pixel_mm[0]), np.arange(0, 120, pixel_mm[1]))
     across_mm = i - 80.0
     sector = (np.abs(across_mm) <= 25 + widening * j) & (j > 0)
     # Beams that widen by 0.7 to either side meet 25 / 0.7 mm above the picture.
     reach_mm = j if widening == 0 else np.hypot(across_mm, j + 25 / widening)
     air = sector * (40 + 30 * np.cos(reach_mm / 12)) + sector * 60
     body = np.where(np.hypot(across_mm + 10, j - 60) < 25, sector * 5.0, air)
-    contact = Contact.of(sector, np.ones(2))
+    contact = Contact.of(sector, np.array(pixel_mm))
     images = np.stack([air, body]).astype(np.float32)
     np.testing.assert_array_equal(contact.touching(images), [False, True])
+
+
+@pytest.mark.parametrize("pixel_mm", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5)])
+def test_beams_meet_where_the_edges_of_a_fan_do(pixel_mm):
+    """A width told too small by a pixel, 1 mm at most, puts that by 1 / 1.4 mm too low."""
+    i, j = np.meshgrid(np.arange(0, 240, pixel_mm[0]), np.arange(0, 120, pixel_mm[1]))
+    sector = np.abs(i - 120.0) <= 25 + 0.7 * j
+    assert _apex_mm(sector, np.array(pixel_mm)) == pytest.approx(-25 / 0.7, abs=0.8)
 
 
 def test_frames_in_air_leave_the_samples_of_the_others_as_they_are(recording):

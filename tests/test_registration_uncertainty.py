@@ -29,6 +29,7 @@ from pipeline.registration.uncertainty import (
     expected_tre_mm,
     floor_of,
     in_radians,
+    long_run,
     motion_between,
     rising,
     sandwich,
@@ -115,6 +116,33 @@ def test_a_direction_that_no_frame_fixes_is_left_open():
     spread = np.sqrt(np.diag(sandwich(curvature_at(losses), np.zeros(30, int))))
     assert spread[0] > 10
     assert spread[1:].max() < 1
+
+
+def test_a_direction_in_which_losses_fall_is_left_open():
+    slopes = np.random.default_rng(2).normal(size=(30, 6))
+    bending = np.diag([-30.0] + [30.0] * 5)
+    spread = np.sqrt(np.diag(sandwich(Curvature(slopes, bending), np.zeros(30, int))))
+    assert spread[0] > 10
+    assert spread[1:].max() < 1
+
+
+@pytest.mark.parametrize(
+    ("sizes", "reach", "lags"),
+    [((12,), 0.25, (3,)), ((12, 4), 0.25, (3, 1)), ((3, 2), 0.1, (1, 1)), ((5, 1), 1.0, (4, 0))],
+)
+def test_neighbours_weigh_as_in_the_squares_of_running_sums(sizes, reach, lags):
+    """With Bartlett's weights over m lags the covariance is the mean of m + 1 products of sums over
+    m + 1 frames, at all places where these overlap the sweep (Newey and West's proof that it is
+    none below zero). At least the next frame counts, however few there are."""
+    rng = np.random.default_rng(5)
+    own = [rng.normal(size=(size, 3)) for size in sizes]
+    expected = np.zeros((3, 3))
+    for slopes, count in zip(own, lags, strict=True):
+        window = np.ones(count + 1)
+        sums = np.stack([np.convolve(column, window) for column in slopes.T])
+        expected += sums @ sums.T / (count + 1)
+    found = long_run(np.concatenate(own), np.repeat(np.arange(len(sizes)), sizes), reach)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @given(st.integers(0, 10_000))
@@ -204,7 +232,18 @@ class TestVerdict:
         assert judge(Evidence(**SOUND), RegisterSettings()).grade == "good"
 
     @pytest.mark.parametrize(
-        "change", [{"shift_mm": 29.0}, {"turn_deg": 29.0}, {"rival": 0.7}, {"confidence": 2.1}]
+        "change",
+        [
+            {"shift_mm": 29.0},
+            {"turn_deg": 29.0},
+            {"rival": 0.75},
+            # A quarter more than is needed.
+            {"confidence": 2.0},
+            # Three frames in four.
+            {"valid": 36},
+            # Parts of right studies agreed better with poses of their own by 0.042 at most.
+            {"apart": 0.045},
+        ],
     )
     def test_what_lies_within_the_limits_is_good(self, change):
         """The search takes starts of 20 mm and 20 degrees, and an optimum may lie beyond."""
@@ -216,7 +255,7 @@ class TestVerdict:
 
     def test_a_size_is_named_as_the_cause_of_a_failure_but_where_frames_fit_better_elsewhere(self):
         wrong = SOUND | {"expected_mm": 9.0, "size": Size(0.08, 0.1)}
-        for confidence, named in ((1.7, True), (0.9, False)):
+        for confidence, named in ((1.7, True), (1.1, True), (0.9, False)):
             said = judge(Evidence(**(wrong | {"confidence": confidence})), RegisterSettings())
             assert said.grade == "failed"
             assert ("8% larger" in said.reason) == named
@@ -226,7 +265,9 @@ class TestVerdict:
         [
             ({"expected_mm": 2.0}, "expected error 2.0 mm"),
             ({"confidence": 1.7}, "1.70 times"),
-            ({"rival": 0.8}, "to 80%"),
+            ({"confidence": 1.95}, "1.95 times"),
+            ({"rival": 0.76}, "to 76%"),
+            ({"rival": 0.9}, "to 90%"),
             ({"valid": 35}, "35 of 48 frames that show the heart"),
             ({"valid": 24}, "24 of 48 frames that show the heart"),
             ({"outvoted": (2,)}, "few frames of sweep 2 bear out"),
@@ -257,7 +298,9 @@ class TestVerdict:
                 {"confidence": 0.5, "misplaced": "mirrored"},
                 "; mirrored they agree 2.0 times better",
             ),
-            ({"rival": 0.95}, "two poses far apart"),
+            # Frames that agree with nothing where they came.
+            ({"confidence": 0.0, "misplaced": "mirrored"}, "; mirrored they agree"),
+            ({"rival": 0.91}, "two poses far apart"),
             ({"valid": 3}, "only 3 of 48"),
             ({"valid": 23}, "only 23 of 48 frames that show the heart bear the registration out"),
             ({"expected_mm": 9.0, "astray": (12, 1)}, "12 frames in a row of sweep 1"),
@@ -312,6 +355,13 @@ class TestVerdict:
         assert space._verdict(found, search, (40,), 1.0).grade == "good"
         assert space._verdict(found, search, (20, 20), 1.0).grade == "good"
 
+    def test_frames_that_agree_best_as_they_came_are_not_said_to_agree_better_otherwise(self):
+        weak = SOUND | {"confidence": 1.1, "shift_mm": 31.0, "misplaced": "mirrored"}
+        said = judge(Evidence(**weak), RegisterSettings())
+        assert said.grade == "failed"
+        assert "mirrored" not in said.reason
+        assert "give a better start" in said.reason
+
     def test_settings_refuse_bounds_that_cross(self):
         with pytest.raises(ValueError, match="raise worst_tre_mm or lower good_tre_mm"):
             RegisterSettings(good_tre_mm=3, worst_tre_mm=2)
@@ -344,6 +394,10 @@ def test_a_turn_that_the_shift_undoes_at_a_point_leaves_it_in_its_place():
     way = 0.05 * np.array([0, -60.0, 0, 0, 0, 1])
     points_mm = PIVOT.centre_mm + np.array([[60.0, 0, 0]])
     assert chance_below(np.outer(way, way), PIVOT.centre_mm, points_mm, 1e-3) == 1
+    # Rounding takes some of such squares below zero.
+    for turn in np.linspace(0.01, 0.1, 20):
+        still = turn * np.array([0, -60.0, 0, 0, 0, 1])
+        assert expected_tre_mm(np.outer(still, still), PIVOT.centre_mm, points_mm) < 1e-6
 
 
 def test_nine_frames_that_bear_it_out_are_one_too_few():
@@ -367,6 +421,9 @@ def test_six_fitted_parameters_are_taken_off_the_frames():
     # Frames of sweeps of their own: slopes' squares add up to 2, and 12 frames leave 6 free.
     found = sandwich(Curvature(slopes, np.eye(6)), np.arange(12))
     np.testing.assert_allclose(found, 4 * np.eye(6))
+    # No fewer than one is free, though six frames or fewer are all fitted.
+    found = sandwich(Curvature(slopes[[0, 6]], np.eye(6)), np.arange(2))
+    np.testing.assert_allclose(found, np.diag([4.0] + [0.0] * 5))
 
 
 @pytest.mark.parametrize(
@@ -402,6 +459,7 @@ def test_what_bends_downwards_is_taken_out_and_the_rest_is_as_it_was():
 def test_a_slope_that_all_frames_share_is_no_spread_between_them():
     slopes = np.random.default_rng(3).normal(size=(40, 6))
     apart, shared = (
-        sandwich(Curvature(slopes + both, BENDING), np.repeat([0, 1], 20)) for both in (0.0, 0.7)
+        sandwich(Curvature(slopes + both, BENDING), np.repeat([0, 1], 20))
+        for both in (np.zeros(6), np.array([0.7, -0.4, 0.0, 2.0, 0.1, -3.0]))
     )
     np.testing.assert_allclose(apart, shared, rtol=1e-9, atol=1e-12)
