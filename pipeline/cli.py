@@ -308,7 +308,7 @@ def _verify(field: Path, surfaces: Path | None) -> None:
 
 
 @app.command
-def export(field: Path, /, *, to: str, out: Path) -> int:
+def export(field: Path, /, *, to: str, out: Path | None = None) -> int:
     """Write a baked field's distances and potentials for other programs.
 
     Parameters
@@ -319,13 +319,13 @@ def export(field: Path, /, *, to: str, out: Path) -> int:
         nrrd (3D Slicer sequences), nifti, vti (ParaView), mhd (headers that point into the field,
         without a copy) or sofa (raw distance grids).
     out
-        Folder to write; must not exist.
+        Folder to write; must not exist. By default field-FORMAT, where you are.
     """
     from pipeline.field.export import export_field, lost_in
     from pipeline.field.files import read_metadata
     from pipeline.field.verify import told_doubts
 
-    show(f"exported  {export_field(field, to, out)}")
+    show(f"exported  {export_field(field, to, out or Path(f'field-{to}'))}")
     # No other format has room for them.
     _tell_doubts(told_doubts(read_metadata(field).source))
     _tell_if_stale(field)

@@ -65,6 +65,16 @@ def test_certificate_is_what_an_independent_check_finds(tmp_path):
     # Percentiles of 4000 draws: 1 % +- 0.16 % lie above; the density there lets that be 30 %.
     assert np.percentile(error, 99) == pytest.approx(said["distance_error_p99_mm"], rel=0.3)
     assert 0.3 < error.max() / said["distance_error_max_mm"] < 3
+    nodes_mm = field.grid.nodes_mm().reshape(-1, 3)
+    # What is answered at nodes departs from what is stored about the surface alone.
+    nodes_mm = nodes_mm[np.abs(field.stored_distance_mm("lump", 0).ravel()) < 6]
+    exact_mm, answered_mm = (
+        ExactSurface(surface).distance_mm(nodes_mm),
+        field.distance_mm(nodes_mm, 0),
+    )
+    assert np.abs(answered_mm - exact_mm).max() <= said["distance_error_max_mm"] + 1e-5
+    beside_mm = np.abs(exact_mm[np.signbit(exact_mm) != np.signbit(answered_mm)])
+    assert said["wrong_side_max_mm"] == pytest.approx(beside_mm.max(initial=0), abs=1e-5)
     # The interpolant of an exact field of slope 1 errs by less than half a voxel anywhere.
     assert said["distance_error_max_mm"] < 1.0
     on_mm = np.abs(field.distance_mm(points_about(surface, np.random.default_rng(98), 4000, 0), 0))
@@ -576,7 +586,14 @@ def test_nodes_on_the_wrong_side_are_counted_however_near_the_surface(tmp_path):
     values = np.memmap(chunk, "<f4", "r+")
     values[np.abs(values) < 2] *= -1
     surfaces = {name: ball_and_core()[name] for name in field.structures}
-    assert certify(field, surfaces, 2000, lambda: None)["sign_errors"] > 0
+    said = certify(field, surfaces, 2000, lambda: None)
+    assert said["sign_errors"] > 0
+    # Their distances were told with the other sign, so what is answered there is twice as far off.
+    ball = said["structures"]["ball"]
+    assert 1.8 < ball["wrong_side_max_mm"] < 2
+    assert ball["wrong_side_max_mm_by_phase"][0] == ball["wrong_side_max_mm"]
+    assert 3.6 < ball["distance_error_max_mm"] < 4.2
+    assert said["structures"]["core"]["wrong_side_max_mm"] < 0.2
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,15 @@ def test_command_writes_and_says_where(path, tmp_path, capsys):
     assert (tmp_path / "out" / "distance_ball.mhd").exists()
 
 
+def test_command_writes_where_one_is_unless_told_where(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(path), "--to", "mhd"]) == 0
+    assert "field-mhd" in capsys.readouterr().out
+    assert (tmp_path / "field-mhd" / "distance_ball.mhd").exists()
+    assert main(["export", str(path), "--to", "mhd"]) == 2
+    assert "--out field-mhd: exists already" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("phases", "form", "off"),
     [

@@ -1,7 +1,8 @@
 """The accuracy certificate of a baked field: measured on the finished values, none assumed.
 
-Distances and directions are checked against VTK, which shares no code with the baking; forces are
-compared between neighbouring nodes and phases, and between places 0.1 mm and moments 1 ms apart.
+Distances and directions are checked against VTK, which shares no code with the baking, and what
+is answered at the nodes against what is stored there; forces are compared between neighbouring
+nodes and phases, and between places 0.1 mm and moments 1 ms apart.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from pipeline.geometry import Float, Surface
 
 BAND_MM = 15.0
 """How far from the surface the interpolated distance is checked."""
+ANSWERED = 2.0
+"""Within how many spacings of the surface all nodes are asked. No answer is moved by more than one
+(`pipeline.field.surface_fit.MOST_CHANGE`), so none farther off comes to the other side."""
 DIRECTION_BAND_MM = 5.0
 DIRECTION_SAMPLES = 60
 """Directions are checked nearer, at fewer points: there the fixtures act."""
@@ -65,7 +69,8 @@ def certify(
         for index in range(len(volume.phases)):
             steps = [pool.submit(one.add, index) for one in forces.values()]
             for name, found in distances.items():
-                found.append(_distance_errors(volume, name, index, surfaces[name], samples))
+                errors = _distance_errors(volume, name, index, surfaces[name], samples)
+                found.append(errors | _answered_errors(volume, name, index, nodes_mm))
             for step in steps:
                 step.result()
             progress()
@@ -162,6 +167,25 @@ def _distance_errors(
     }
 
 
+def _answered_errors(
+    volume: ForceField, structure: str, index: int, nodes_mm: Float
+) -> dict[str, float]:
+    """How far what is answered at nodes about the surface is from what is stored there, which is
+    exact, at most; and how far from the surface a node is told to be on the other side.
+
+    They differ by what moved the splines' zeros to the surface between nodes.
+    """
+    stored = volume.stored_distance_mm(structure, index).ravel()
+    near = np.abs(stored) <= ANSWERED * max(volume.grid.spacing_mm)
+    stored = stored[near]
+    answered = volume.distance_mm(nodes_mm[near], volume.phases[index], structure)
+    wrong = np.signbit(answered) != np.signbit(stored)
+    return {
+        "answered": float(np.abs(answered - stored).max(initial=0.0)),
+        "wrong_side": float(np.abs(stored[wrong]).max(initial=0.0)),
+    }
+
+
 def _gradient_errors(
     volume: ForceField,
     structure: str,
@@ -190,22 +214,25 @@ def _over_phases(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         np.concatenate([one[part] for one in found])
         for part in ("between", "surface", "slope", "turned")
     )
+    largest = [max(float(one["between"].max()), one["answered"]) for one in found]
     return {
-        "distance_error_max_mm": float(between.max()),
+        "distance_error_max_mm": max(largest),
         "distance_error_p99_mm": float(np.percentile(between, 99)),
         "surface_error_max_mm": float(surface.max()),
         "surface_error_p99_mm": float(np.percentile(surface, 99)),
         "node_error_near_mm": max(one["near"] for one in found),
         "node_error_far_mm": max(one["far"] for one in found),
+        "wrong_side_max_mm": max(one["wrong_side"] for one in found),
         "gradient_error_median": float(np.median(slope)),
         "gradient_error_p99": float(np.percentile(slope, 99)),
         "direction_error_median_deg": float(np.median(turned)),
         "direction_error_p99_deg": float(np.percentile(turned, 99)),
         "sign_errors": sum(one["signs"] for one in found),
-        "distance_error_max_mm_by_phase": [float(one["between"].max()) for one in found],
+        "distance_error_max_mm_by_phase": largest,
         "surface_error_max_mm_by_phase": [float(one["surface"].max()) for one in found],
         "gradient_error_median_by_phase": [float(np.median(one["slope"])) for one in found],
         "sign_errors_by_phase": [one["signs"] for one in found],
+        "wrong_side_max_mm_by_phase": [one["wrong_side"] for one in found],
     }
 
 

@@ -11,6 +11,10 @@ linear least maximum approximations, UCLA 1961). Points are asked for at three m
 phase, where vertices follow their own spline in time. Where phases are few nobody knows where the
 surface was between them, and a zero that is bent to a guess bends the distance about it: such a
 point weighs by the inverse of its variance.
+
+The nodes about the surface are held at what they have, for there the distance is exact at stored
+phases: where sheets are nearer to each other than the grid can show, such as at the tip of a vein,
+the zero would otherwise come to their points by islands beside them and holes between them.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ import numpy.typing as npt
 
 from pipeline.field.fit_kernels import gather, mix, room, scatter, share, touch
 from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
-from pipeline.field.spline import phase_weights, timeline
+from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.field.threads import processors
 from pipeline.geometry import (
     Float,
@@ -58,6 +62,12 @@ MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
 suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
+HELD, HELD_WITHIN = 0.1, 1.0
+"""Weight of a node's squared change beside the squared distance of one point, and by how many
+spacings nodes are held. More of either costs the zero more between nodes and phases."""
+HELD_NEAR, HELD_SHARE = 0.15, 0.45
+"""A node whose distance changes by less than this share of the grid's spacing, or of that distance,
+gets no more weight: a node that comes to lie on the other side changes by all of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +85,9 @@ class _Moment:
 
     near_enough_mm: Float32
     """``(point,)``: one that is nearer to the spline's zero gets no more weight."""
+
+    held: bool = False
+    """Whether points are nodes, whose distance is to stay as it is instead of coming to zero."""
 
 
 def fit_to_surface(
@@ -132,6 +145,7 @@ def fit_to_surface(
     touched = np.zeros(shape, dtype=bool)
     for moment in moments:
         touch(touched, moment.nodes)
+    moments += _held([one[box] for one in splines], phases, touched, step_mm)
     shell = np.flatnonzero(touched).astype(np.uint32)
     near = np.stack([one[box].ravel()[shell] for one in splines])
     # No more runs than this are apart, and each thread has room of its own.
@@ -233,6 +247,28 @@ def _box(points_mm: Sequence[Float], grid: Grid) -> tuple[list[int], list[int]]:
     return low.tolist(), high.tolist()
 
 
+def _held(
+    splines: Sequence[Float32], phases: Float, touched: npt.NDArray[np.bool_], step_mm: float
+) -> list[_Moment]:
+    """The nodes near the surface at every stored phase, of those whose coefficients are asked."""
+    # A node at the end of the box asks for coefficients beyond it.
+    held = np.zeros_like(touched)
+    held[1:-1, 1:-1, 1:-1] = touched[1:-1, 1:-1, 1:-1]
+    nodes = np.argwhere(held)[:, ::-1].astype(np.float32)
+    line = timeline(phases)
+    moments = []
+    for phase in phases.tolist():
+        interval, weights = phase_weights(line, phase)
+        about = [splines[(interval + step) % len(splines)] for step in (-1, 0, 1)]
+        mixed = sum(weight * one for weight, one in zip(weights, about, strict=True))
+        distance_mm = np.abs(node_values(np.asarray(mixed))[held])
+        near = distance_mm <= HELD_WITHIN * step_mm
+        near_enough_mm = np.maximum(HELD_NEAR * step_mm, HELD_SHARE * distance_mm[near])
+        parts = np.array(weights, dtype=np.float32), near_enough_mm.astype(np.float32)
+        moments.append(_Moment(nodes[near], interval, *parts, held=True))
+    return moments
+
+
 class _Layers(threading.local):
     """What each thread has for itself, ``(z, y, x)``."""
 
@@ -263,10 +299,18 @@ class _Fit:
         self._shell = shell
         self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
         self._change = np.zeros_like(coefficients)
-        self._before = [-one for one in self._values(coefficients)]
+        self._before = [
+            np.zeros_like(found) if one.held else -found
+            for one, found in zip(moments, self._values(coefficients), strict=True)
+        ]
         self._off = [one.copy() for one in self._before]
         near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
-        self._weights = [np.square(near_enough_mm / one.near_enough_mm) for one in moments]
+        self._weights = [
+            np.full_like(one.near_enough_mm, HELD)
+            if one.held
+            else np.square(near_enough_mm / one.near_enough_mm)
+            for one in moments
+        ]
 
     def after(self, rounds: int) -> Float32:
         """The change after some rounds of reweighted least squares."""
