@@ -3,7 +3,8 @@
 Between the nodes a field is a tensor product of quadratic B-splines along x, y, z and the phase,
 the smallest interpolation whose gradient and rate have no step anywhere: three nodes an axis
 (Unser, IEEE Signal Process. Mag. 16(6):22-38, 1999). Its coefficients are solved for once, at
-baking, such that the spline takes the exact distance at every node and stored phase.
+baking, such that the spline takes the exact distance at every node and stored phase; about the
+surface they are moved once more (`pipeline.field.surface_fit`).
 """
 
 from __future__ import annotations
