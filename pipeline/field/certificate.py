@@ -28,7 +28,8 @@ BAND_MM = 15.0
 """How far from the surface the interpolated distance is checked."""
 ANSWERED = 2.0
 """Within how many spacings of the surface all nodes are asked. No answer is moved by more than one
-(`pipeline.field.surface_fit.MOST_CHANGE`), so none farther off comes to the other side."""
+(`pipeline.field.surface_fit.MOST_CHANGE`), so none farther off comes to the other side. Nodes that
+a fast surface passes two phases away are moved, too, farther from where it is."""
 DIRECTION_BAND_MM = 5.0
 DIRECTION_SAMPLES = 60
 """Directions are checked nearer, at fewer points: there the fixtures act."""
@@ -214,9 +215,10 @@ def _over_phases(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         np.concatenate([one[part] for one in found])
         for part in ("between", "surface", "slope", "turned")
     )
-    largest = [max(float(one["between"].max()), one["answered"]) for one in found]
+    # NumPy's maximum of what is no number is none, either.
+    largest = [float(np.maximum(one["between"].max(), one["answered"])) for one in found]
     return {
-        "distance_error_max_mm": max(largest),
+        "distance_error_max_mm": float(np.max(largest)),
         "distance_error_p99_mm": float(np.percentile(between, 99)),
         "surface_error_max_mm": float(surface.max()),
         "surface_error_p99_mm": float(np.percentile(surface, 99)),

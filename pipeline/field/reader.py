@@ -58,9 +58,10 @@ class ForceField:
     """A moving distance field and the forces of its fixtures, in LPS mm of the MR frame.
 
     The distance is a quadratic B-spline in space and time. It takes the stored distance at every
-    node and phase but for about the surface, where it was moved such that its zero lies on the
-    surface between nodes, too (`pipeline.field.surface_fit`). Its gradient is exact, and neither it
-    nor the rate of change has a step at voxel faces, at phases, or where the cycle closes.
+    node and phase but for where the surface is or passes up to two phases away: there it was moved
+    such that its zero lies on the surface between nodes, too (`pipeline.field.surface_fit`). Its
+    gradient is exact, and neither it nor the rate of change has a step at voxel faces, at phases,
+    or where the cycle closes.
     Potential and force are the formulas evaluated on it.
 
     The direction of the force is ``g / max(|g|, 0.5)`` for the gradient g: a unit vector except
