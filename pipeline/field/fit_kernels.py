@@ -78,6 +78,16 @@ def _squares(weights):  # type: ignore[no-untyped-def]
 
 
 @door(*_SOURCES, **_ASKED)
+def carry(values, corners, shares, found):  # type: ignore[no-untyped-def]
+    """What vertices have, ``(vertex, 4)``, at points that share in three of them each."""
+    for n in range(len(corners)):
+        a, b, c = corners[n, 0], corners[n, 1], corners[n, 2]
+        p, q, r = shares[n, 0], shares[n, 1], shares[n, 2]
+        for k in range(4):
+            found[n, k] = p * values[a, k] + q * values[b, k] + r * values[c, k]
+
+
+@door(*_SOURCES, **_ASKED)
 def touch(touched, nodes):  # type: ignore[no-untyped-def]
     """Mark the nodes that points ask."""
     for n in range(len(nodes)):

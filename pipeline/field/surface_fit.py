@@ -8,9 +8,11 @@ Numerical Methods for Least Squares Problems, SIAM 1996), scaled by the diagonal
 the points that are still too far off get more weight, in proportion to it: so Lawson's
 algorithm goes from least squares to the least maximum (Lawson, Contributions to the theory of
 linear least maximum approximations, UCLA 1961). Points are asked for at three moments a stored
-phase, where vertices follow their own spline in time. Where phases are few nobody knows where the
-surface was between them, and a zero that is bent to a guess bends the distance about it: such a
-point weighs by the inverse of its variance.
+phase, where vertices follow their own spline in time. They are few, for most of a surface needs no
+more; before some rounds many more places are looked at, and those that are too far off become
+points (the exchange of Remez: Cheney, Introduction to Approximation Theory, 1966, chapter 3).
+Where phases are few nobody knows where the surface was between them, and a zero that is bent to a
+guess bends the distance about it: such a point weighs by the inverse of its variance.
 
 The nodes about the surface are held at what they have, for there the distance is exact at stored
 phases: where sheets are nearer to each other than the grid can show, such as at the tip of a vein,
@@ -23,13 +25,13 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.field.fit_kernels import gather, mix, room, scatter, share, touch
+from pipeline.field.fit_kernels import carry, gather, mix, room, scatter, share, touch
 from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
 from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.field.threads import processors
@@ -47,7 +49,16 @@ T = TypeVar("T")
 
 MOMENTS_A_PHASE = 3
 POINTS_A_CELL = 2.0
-"""Points of the surface for each square of the grid's spacing, beside vertices and edges."""
+"""Points of the surface for each square of the grid's spacing, one for each triangle at least,
+beside vertices."""
+LOOKED_A_CELL, LOOKED_A_SPACING = 6.0, 2.0
+"""Places of the surface that are looked at for each square of the grid's spacing, and for each
+spacing along an edge; one for each triangle and edge at least."""
+ENOUGH_A_CELL = 5.0
+"""Of a mesh with many more vertices, edges or triangles for each square of the grid's spacing some
+are taken."""
+LOOK_BEFORE = 2, 5, 8, 10
+"""Rounds before which places are looked at; those that are too far off are points from then on."""
 DAMPING = 0.06
 """Weight of a coefficient's squared change beside the squared distance of one point."""
 NEAR_ENOUGH = 0.035
@@ -62,12 +73,73 @@ MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
 suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
+UNKNOWN = 1e38
+"""Stands for coefficients that no point asks: whoever asks one by the least of weights finds more
+than a surface is ever off."""
 HELD, HELD_WITHIN = 0.1, 1.0
 """Weight of a node's squared change beside the squared distance of one point, and by how many
 spacings nodes are held. More of either costs the zero more between nodes and phases."""
 HELD_NEAR, HELD_SHARE = 0.15, 0.45
 """A node whose distance changes by less than this share of the grid's spacing, or of that distance,
 gets no more weight: a node that comes to lie on the other side changes by all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Spread:
+    """Material points of a mesh."""
+
+    corners: Integer
+    """``(n, 3)`` vertex numbers."""
+
+    shares: Float32
+    """``(n, 3)`` of the corners."""
+
+    @classmethod
+    def points(cls, surface: Surface, step_mm: float, first: int) -> _Spread:
+        """What the fit begins with: vertices, which stand out most, and points of all triangles."""
+        inside = _over_triangles(surface, step_mm, POINTS_A_CELL, first)
+        corners = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
+        corners = _some(corners, surface, step_mm)
+        return cls._of(inside, cls(corners, np.full(corners.shape, 1 / 3, dtype=np.float32)))
+
+    @classmethod
+    def looked_at(cls, surface: Surface, step_mm: float, first: int) -> _Spread:
+        """More places, of triangles and edges."""
+        inside = _over_triangles(surface, step_mm, LOOKED_A_CELL, first)
+        edges = _some(_edges(surface.triangles), surface, step_mm)
+        ends_mm = surface.vertices_mm[edges]
+        length = np.linalg.norm(ends_mm[:, 1] - ends_mm[:, 0], axis=1) / step_mm
+        counts = np.maximum(1, np.round(LOOKED_A_SPACING * length)).astype(int)
+        share = (_numbered(counts) + 1) / np.repeat(counts + 1, counts)
+        corners = np.repeat(edges, counts, axis=0)[:, [0, 1, 1]]
+        shares = np.stack([1 - share, share, np.zeros_like(share)], axis=1)
+        return cls._of(inside, cls(corners, shares.astype(np.float32)))
+
+    @classmethod
+    def _of(cls, one: _Spread, other: _Spread) -> _Spread:
+        corners = np.concatenate([one.corners, other.corners])
+        return cls(corners, np.concatenate([one.shares, other.shares]))
+
+    def carried(self, values: Float32) -> Float32:
+        """What vertices have, ``(vertex, 4)``, at the points ``(n, 4)``."""
+        found = np.empty((len(self.corners), 4), dtype=np.float32)
+        carry(values, self.corners, self.shares, found)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Sheet:
+    """The surface at one phase."""
+
+    phase: float
+    vertices: Float32
+    """``(vertex, 4)``: x, y, z counted in nodes, and by about how many mm each may be off."""
+
+    points: _Spread
+    """Where the distance is to be zero."""
+
+    looked_at: _Spread
+    """And where it is looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +158,9 @@ class _Moment:
     near_enough_mm: Float32
     """``(point,)``: one that is nearer to the spline's zero gets no more weight."""
 
-    held: bool = False
-    """Whether points are nodes, whose distance is to stay as it is instead of coming to zero."""
+    sheet: _Sheet | None = None
+    """Where more places are to be looked at; None where points are nodes, whose distance is to stay
+    as it is instead of coming to zero."""
 
 
 def fit_to_surface(
@@ -124,24 +197,23 @@ def fit_to_surface(
     """
     if rounds == 0:
         return 0.0
-    places = [one.inside(grid) for one in _places(moving, phases, grid)]
-    # Between phases that lie close together a spline may carry all points out of the grid.
-    places = [one for one in places if len(one.points_mm)]
-    if not places:
-        return 0.0
-    low, high = _box([one.points_mm for one in places], grid)
+    step_mm = min(grid.spacing_mm)
+    sheets = list(_sheets(moving, phases, grid))
+    low, high = _box([one.vertices for one in sheets], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+    shape = splines[0][box].shape
     line = timeline(phases)
     moments = []
-    step_mm = min(grid.spacing_mm)
-    for one in places:
+    for one in sheets:
         interval, weights = phase_weights(line, one.phase)
-        nodes = (one.points_mm - grid.origin_mm) / np.array(grid.spacing_mm) - low
-        near_enough_mm = np.maximum(NEAR_ENOUGH * step_mm, one.unsure_mm).astype(np.float32)
-        parts = nodes.astype(np.float32), interval, np.array(weights, dtype=np.float32)
-        moments.append(_Moment(*parts, near_enough_mm))
-    del places
-    shape = splines[0][box].shape
+        moved = replace(one, vertices=one.vertices - np.array([*low, 0], dtype=np.float32))
+        nodes, near_enough_mm = _asked(moved, one.points, shape, step_mm)
+        parts = nodes, interval, np.array(weights, dtype=np.float32), near_enough_mm
+        moments.append(_Moment(*parts, moved))
+    del sheets
+    # A surface may lie outside the grid, all of it.
+    if not any(len(one.nodes) for one in moments):
+        return 0.0
     touched = np.zeros(shape, dtype=bool)
     for moment in moments:
         touch(touched, moment.nodes)
@@ -159,91 +231,97 @@ def fit_to_surface(
     return float(np.abs(change).max())
 
 
-@dataclass(frozen=True, slots=True)
-class _Places:
-    """Points of the surface at one phase."""
-
-    phase: float
-    points_mm: Float
-    """``(n, 3)``."""
-
-    unsure_mm: Float
-    """``(n,)``: by about how much each may be off."""
-
-    def inside(self, grid: Grid) -> _Places:
-        """Those whose three nodes an axis are all in the grid."""
-        nodes = (self.points_mm - grid.origin_mm) / np.array(grid.spacing_mm)
-        # The last thousandth would be none, rounded to single precision.
-        held = ((nodes >= 0.5) & (nodes < np.array(grid.shape[::-1]) - 1.501)).all(1)
-        return _Places(self.phase, self.points_mm[held], self.unsure_mm[held])
-
-
-def _places(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Places]:
-    """Points at some moments: at stored phases, and where vertices correspond the
-    same material points between them, but in no gap: what a spline of few phases cannot follow
-    there, it would make up for at the phases beside it."""
+def _sheets(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Sheet]:
+    """The surface at some moments: at stored phases, and where vertices correspond between them,
+    but in no gap: what a spline of few phases cannot follow there, it would make up for at the
+    phases beside it."""
     step_mm = min(grid.spacing_mm)
+
+    def placed(vertices_mm: Float, unsure_mm: Float) -> Float32:
+        nodes = (vertices_mm - grid.origin_mm) / np.array(grid.spacing_mm)
+        return np.column_stack([nodes, unsure_mm]).astype(np.float32)
+
     motion = Motion.of(moving)
     if motion is None:
         for index, phase in enumerate(phases.tolist()):
             surface = moving.at(index)
-            points_mm = _carried(surface.vertices_mm, *_spread_over(surface, step_mm))
-            yield _Places(phase, points_mm, np.zeros(len(points_mm)))
+            vertices = placed(surface.vertices_mm, np.zeros(len(surface.vertices_mm)))
+            yield _Sheet(phase, vertices, *_spreads(surface, step_mm, index))
         return
-    corners, shares = _spread_over(moving.at(0), step_mm)
+    spreads = [_spreads(moving.at(0), step_mm, number) for number in range(MOMENTS_A_PHASE)]
     moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
     moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
     unsure_of_each_mm = np.zeros(motion.places_mm.shape[:2])
     if len(phases) < FEW_PHASES:
         unsure_of_each_mm = motion.unsure_mm()
-    for (stored, *later), unsure_mm in zip(moments.tolist(), unsure_of_each_mm, strict=True):
-        yield _Places(
-            stored, _carried(motion.at(stored).vertices_mm, corners, shares), np.zeros(len(corners))
-        )
-        around_mm = _carried(unsure_mm, corners, shares)
-        for phase in later:
+    for row, unsure_mm in zip(moments.tolist(), unsure_of_each_mm, strict=True):
+        for number, (phase, spread) in enumerate(zip(row, spreads, strict=True)):
             if np.isfinite(phase):
-                yield _Places(
-                    phase, _carried(motion.at(phase).vertices_mm, corners, shares), around_mm
-                )
+                vertices_mm = motion.at(phase).vertices_mm
+                yield _Sheet(phase, placed(vertices_mm, unsure_mm * (number > 0)), *spread)
 
 
-def _spread_over(surface: Surface, step_mm: float) -> tuple[Integer, Float]:
-    """Points spread evenly over a surface, its vertices, which stand out most, and the middles of
-    its edges: ``(n, 3)`` vertex numbers and their shares."""
-    triangles = surface.triangles
-    corners_mm = surface.vertices_mm[triangles]
-    area = np.cumsum(np.linalg.norm(area_vectors(corners_mm), axis=1)) / 2
-    count = int(np.ceil(POINTS_A_CELL * area[-1] / step_mm**2))
-    chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
-    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]]))
-    edges = np.unique(sides, axis=0)[:, [0, 1, 1]]
-    vertices = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
-    # A mesh that is much finer than the grid has more of them than it takes.
-    some = [one[:: max(1, len(one) // (2 * count))] for one in (vertices, edges)]
-    shares = [spread_over_triangle(count)]
-    shares += [np.tile((0.5, 0.25, 0.25), (len(one), 1)) for one in some]
-    return np.concatenate([triangles[chosen], *some]), np.concatenate(shares)
-
-
-def _carried(values: Float, corners: Integer, shares: Float) -> Float:
-    """What vertices have, ``(vertex, ...)``, at material points ``(n, ...)``."""
-    return np.asarray(
-        sum((shares[:, k] * values[corners[:, k]].T).T for k in range(3)), dtype=float
+def _spreads(surface: Surface, step_mm: float, number: int) -> tuple[_Spread, _Spread]:
+    """Points and places to look at: other ones for each number."""
+    return (
+        _Spread.points(surface, step_mm, number),
+        _Spread.looked_at(surface, step_mm, number),
     )
 
 
-def _box(points_mm: Sequence[Float], grid: Grid) -> tuple[list[int], list[int]]:
+def _over_triangles(surface: Surface, step_mm: float, a_cell: float, number: int) -> _Spread:
+    """So many points for each square of the grid's spacing, one for each triangle at least."""
+    some = _some(np.arange(len(surface.triangles)), surface, step_mm)
+    counts = np.maximum(1, np.ceil(a_cell * _cells(surface, step_mm)[some] - 0.5)).astype(int)
+    total = int(counts.sum())
+    shares = spread_over_triangle((number + 1) * total)[number * total :]
+    chosen = np.repeat(some, counts)
+    return _Spread(surface.triangles[chosen], shares.astype(np.float32))
+
+
+def _some(ones: Integer, surface: Surface, step_mm: float) -> Integer:
+    """Vertices, edges or triangles; some of them where the mesh is much finer than the grid."""
+    enough = math.ceil(ENOUGH_A_CELL * _cells(surface, step_mm).sum())
+    return ones[:: max(1, len(ones) // enough)]
+
+
+def _cells(surface: Surface, step_mm: float) -> Float:
+    """Squares of the grid's spacing that each triangle would fill, ``(triangle,)``."""
+    twice_mm2 = np.linalg.norm(area_vectors(surface.vertices_mm[surface.triangles]), axis=1)
+    return np.asarray(twice_mm2 / 2 / step_mm**2)
+
+
+def _numbered(counts: Integer) -> Integer:
+    """From 0 for each of them up to its count."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _edges(triangles: Integer) -> Integer:
+    """``(n, 2)`` vertex numbers, each edge once."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]])
+    return np.unique(np.sort(sides), axis=0)
+
+
+def _asked(
+    sheet: _Sheet, spread: _Spread, shape: tuple[int, ...], step_mm: float
+) -> tuple[Float32, Float32]:
+    """Points in the box, ``(n, 3)``, and how near each has to come, mm ``(n,)``."""
+    points = spread.carried(sheet.vertices)
+    nodes, unsure_mm = points[:, :3], points[:, 3]
+    # The last thousandth would ask for one node more, rounded to single precision.
+    inside = ((nodes >= 0.5) & (nodes < np.array(shape[::-1]) - 1.501)).all(axis=1)
+    near_enough_mm = np.maximum(np.float32(NEAR_ENOUGH * step_mm), unsure_mm[inside])
+    return np.ascontiguousarray(nodes[inside]), near_enough_mm
+
+
+def _box(vertices: Sequence[Float32], grid: Grid) -> tuple[list[int], list[int]]:
     """First node (x, y, z) of the part of the grid that points ask, and the one behind its last."""
-    least = np.min([one.min(axis=0) for one in points_mm], axis=0)
-    most = np.max([one.max(axis=0) for one in points_mm], axis=0)
-    low, high = (
-        np.floor((place - grid.origin_mm) / np.array(grid.spacing_mm) + 0.5).astype(int)
-        for place in (least, most)
-    )
+    least = np.min([one[:, :3].min(axis=0) for one in vertices], axis=0)
+    most = np.max([one[:, :3].max(axis=0) for one in vertices], axis=0)
+    shape = np.array(grid.shape[::-1])
     # One node more than needed, for rounding to single precision.
-    low = np.maximum(low - 2, 0)
-    high = np.minimum(high + 3, grid.shape[::-1])
+    low = np.clip(np.floor(least + 0.5).astype(int) - 2, 0, shape)
+    high = np.clip(np.floor(most + 0.5).astype(int) + 3, low, shape)
     return low.tolist(), high.tolist()
 
 
@@ -265,7 +343,7 @@ def _held(
         near = distance_mm <= HELD_WITHIN * step_mm
         near_enough_mm = np.maximum(HELD_NEAR * step_mm, HELD_SHARE * distance_mm[near])
         parts = np.array(weights, dtype=np.float32), near_enough_mm.astype(np.float32)
-        moments.append(_Moment(nodes[near], interval, *parts, held=True))
+        moments.append(_Moment(nodes[near], interval, *parts))
     return moments
 
 
@@ -273,7 +351,8 @@ class _Layers(threading.local):
     """What each thread has for itself, ``(z, y, x)``."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.mixed, self.acting = room(shape), room(shape)
+        self.mixed, self.acting, self.looked_at = room(shape), room(shape), room(shape)
+        self.looked_at.fill(UNKNOWN)
 
 
 class _Fit:
@@ -292,23 +371,23 @@ class _Fit:
         spacing_mm: float,
         pool: ThreadPoolExecutor,
     ) -> None:
-        self._moments = moments
+        self._moments = list(moments)
         self._runs = _runs([one.interval for one in moments], len(coefficients))
         self._pool = pool
         self._layers = _Layers(shape)
         self._shell = shell
-        self._most_mm = np.float32(MOST_CHANGE * spacing_mm)
+        self._coefficients = coefficients
+        self._spacing_mm = spacing_mm
         self._change = np.zeros_like(coefficients)
         self._before = [
-            np.zeros_like(found) if one.held else -found
+            np.zeros_like(found) if one.sheet is None else -found
             for one, found in zip(moments, self._values(coefficients), strict=True)
         ]
         self._off = [one.copy() for one in self._before]
-        near_enough_mm = np.float32(NEAR_ENOUGH * spacing_mm)
         self._weights = [
             np.full_like(one.near_enough_mm, HELD)
-            if one.held
-            else np.square(near_enough_mm / one.near_enough_mm)
+            if one.sheet is None
+            else self._first_weights(one.near_enough_mm)
             for one in moments
         ]
 
@@ -317,13 +396,15 @@ class _Fit:
         for number in range(rounds):
             if number:
                 self._weigh()
+            if number in LOOK_BEFORE:
+                self._look()
             self._least_squares()
             self._bound()
         return self._change
 
     def _bound(self) -> None:
         """Take back what moves a coefficient too far."""
-        most_mm = self._most_mm
+        most_mm = np.float32(MOST_CHANGE * self._spacing_mm)
         if np.abs(self._change).max() > most_mm:
             np.clip(self._change, -most_mm, most_mm, out=self._change)
             moved = self._values(self._change)
@@ -334,6 +415,42 @@ class _Fit:
         for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
             weight *= np.maximum(np.abs(off) / one.near_enough_mm, np.float32(1))
             np.minimum(weight, np.float32(MOST_WEIGHT), out=weight)
+
+    def _look(self) -> None:
+        """Take in places of the surface that are too far off, for the points leave room between
+        them."""
+        coefficients = self._coefficients + self._change
+
+        def look(number: int) -> None:
+            one, layers = self._moments[number], self._layers
+            if one.sheet is None:
+                return
+            shape = layers.mixed.shape
+            nodes, near_enough_mm = _asked(one.sheet, one.sheet.looked_at, shape, self._spacing_mm)
+            mix(coefficients, one.interval, one.weights, layers.looked_at, self._shell)
+            found = self._gathered(layers.looked_at, nodes)
+            off_mm = np.abs(found)
+            missed = (off_mm > near_enough_mm) & (off_mm < MOST_CHANGE * self._spacing_mm)
+            nodes, near_enough_mm, found = nodes[missed], near_enough_mm[missed], found[missed]
+            mix(self._change, one.interval, one.weights, layers.mixed, self._shell)
+            moved = self._gathered(layers.mixed, nodes)
+            more = nodes, near_enough_mm, moved - found, -found, self._first_weights(near_enough_mm)
+            before = self._before[number], self._off[number], self._weights[number]
+            had = one.nodes, one.near_enough_mm, *before
+            nodes, near_enough_mm, *rest = map(np.concatenate, zip(had, more, strict=True))
+            self._moments[number] = replace(one, nodes=nodes, near_enough_mm=near_enough_mm)
+            self._before[number], self._off[number], self._weights[number] = rest
+
+        self._of_each(look, self._moments)
+
+    def _first_weights(self, near_enough_mm: Float32) -> Float32:
+        return np.asarray(np.square(np.float32(NEAR_ENOUGH * self._spacing_mm) / near_enough_mm))
+
+    @staticmethod
+    def _gathered(layer: Float32, nodes: Float32) -> Float32:
+        values = np.empty(len(nodes), dtype=np.float32)
+        gather(layer, nodes, values)
+        return values
 
     def _least_squares(self) -> None:
         """A few steps down the sum of squares."""
