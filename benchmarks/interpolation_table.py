@@ -8,10 +8,10 @@ true surface midway between phases, and in the band about it, where VTK's closes
 mesh is the truth. All ways run through the same plain kernel, so their times compare with each
 other but not with beatfield.h, which does the one chosen in a third of the time.
 
-``--fit``: the chosen way alone, before and after its fit to the surface, asked in the middles of
-triangles too. The way to the zero is what lies between a point of the true surface and the field's
-zero, along the field's gradient: where that is short, as on a sharp rim, a small distance is a
-longer way.
+``--fit``: the chosen way alone, before and after its fit to the surface, asked at all vertices and
+anywhere on triangles. The way to the zero is what lies between a point of the true surface and the
+field's zero, along the field's gradient: where that is short, as on a sharp rim, a small distance
+is a longer way.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from numba import njit
 from scipy.ndimage import spline_filter1d
 
 from data_synth.population import draw_heart
+from pipeline.exact import points_about
 from pipeline.field.distance import distance_of_closed
 from pipeline.field.fixture import BakeSettings
 from pipeline.field.spline import space_coefficients
@@ -137,16 +138,19 @@ def ask(stored: Float, grid: Grid, way: tuple[int, int], points: Float, moments:
 
 
 def truth_at(
-    meshes: list[Surface], moments: Float, rng: np.random.Generator, middles: bool
+    meshes: list[Surface], moments: Float, rng: np.random.Generator, anywhere: int
 ) -> tuple[Truth, Truth]:
-    """On the surface, and in the band about it, at moments that nothing was stored for."""
+    """On the surface, and in the band about it, at moments that nothing was stored for; on the
+    surface at some vertices, or at all of them and at so many places a triangle."""
     on, near = [], []
     for mesh, moment in zip(meshes, moments, strict=True):
         vertices = mesh.vertices_mm
         chosen = vertices[rng.choice(len(vertices), min(1500, len(vertices)), replace=False)]
-        if middles:
-            chosen = np.concatenate([chosen, vertices[mesh.triangles].mean(axis=1)])
-        on.append((chosen, np.full(len(chosen), moment)))
+        asked = chosen
+        if anywhere:
+            asked = points_about(mesh, rng, anywhere * len(mesh.triangles), 0.0)
+            asked = np.concatenate([vertices, asked])
+        on.append((asked, np.full(len(asked), moment)))
         points = chosen[:400] + rng.uniform(-1, 1, (400, 3)) * BAND_MM / np.sqrt(3)
         near.append((points, np.full(400, moment), *_closest(mesh, points)))
     places, times = (np.concatenate(part) for part in zip(*on, strict=True))
@@ -233,7 +237,7 @@ def rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float, see
     """Print the table of one spacing."""
     grid, distance_mm = bake(surfaces, spacing_mm)
     rng = np.random.default_rng(seed)
-    on, near = truth_at(between, midway(surfaces, between), rng, middles=False)
+    on, near = truth_at(between, midway(surfaces, between), rng, anywhere=0)
     megabytes, count = distance_mm.size * 4e-6, len(surfaces)
     print(f"\n{spacing_mm:g} mm, {grid.shape[::-1]} nodes x {count} phases: {megabytes:.1f} MB\n")
     print(
@@ -259,7 +263,7 @@ def fit_rows(surfaces: list[Surface], between: list[Surface], spacing_mm: float,
     """Print what the fit to the surface makes of the chosen way at one spacing."""
     grid, distance_mm = bake(surfaces, spacing_mm)
     rng = np.random.default_rng(seed)
-    on, near = truth_at(between, midway(surfaces, between), rng, middles=True)
+    on, near = truth_at(between, midway(surfaces, between), rng, anywhere=5)
     print(f"\n{spacing_mm:g} mm\n")
     print(
         "| rounds | on the surface, max / 99 % (mm) / share beyond 0.1 mm | band, 99 % (mm) "

@@ -117,7 +117,7 @@ def test_the_fit_brings_the_zero_to_the_surface(tmp_path):
 
 def test_nodes_that_are_held_keep_the_distance_about_a_rim(tmp_path, monkeypatch):
     """Truth: VTK's distance, about a disc that is half a step thick at its middle."""
-    turn = Rotation.from_euler("xz", [0.4, 0.4]).as_matrix()
+    turn = Rotation.from_euler("xz", [1.1, 0.4]).as_matrix()
     ball = sphere(1.0, 4)
     disc = Surface(ball.vertices_mm * (20.0, 8.0, 1.2) @ turn.T, ball.triangles)
     moving = {"disc": SurfaceSeries((disc,), np.array([0.0]))}
@@ -126,9 +126,10 @@ def test_nodes_that_are_held_keep_the_distance_about_a_rim(tmp_path, monkeypatch
     with_it = bake_field(tmp_path / "held.zarr", moving, fixtures, settings)
     monkeypatch.setattr(surface_fit, "_held", lambda *_: [])
     without = bake_field(tmp_path / "free.zarr", moving, fixtures, settings)
-    assert with_it["distance_error_p99_mm"] < 0.92 * without["distance_error_p99_mm"]
+    assert with_it["distance_error_p99_mm"] < 0.95 * without["distance_error_p99_mm"]
+    assert with_it["wrong_side_max_mm"] == 0 < without["wrong_side_max_mm"]
     # What the zero gives for it, of a rim that the grid cannot show.
-    assert with_it["surface_error_p99_mm"] < 1.25 * without["surface_error_p99_mm"]
+    assert with_it["surface_error_p99_mm"] < 1.15 * without["surface_error_p99_mm"]
 
 
 def test_places_between_points_are_looked_at(tmp_path, monkeypatch):

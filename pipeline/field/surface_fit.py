@@ -79,9 +79,10 @@ than a surface is ever off."""
 HELD, HELD_WITHIN = 0.1, 1.0
 """Weight of a node's squared change beside the squared distance of one point, and by how many
 spacings nodes are held. More of either costs the zero more between nodes and phases."""
-HELD_NEAR, HELD_SHARE = 0.15, 0.45
+HELD_NEAR, HELD_SHARE, HELD_POWER = 0.15, 0.65, 4
 """A node whose distance changes by less than this share of the grid's spacing, or of that distance,
-gets no more weight: a node that comes to lie on the other side changes by all of it."""
+gets no more weight: a node that comes to lie on the other side changes by all of it. One that
+changes by more gets more, by this power of how many times as much it is: a few rounds must do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,9 +412,10 @@ class _Fit:
             self._off = [one - other for one, other in zip(self._before, moved, strict=True)]
 
     def _weigh(self) -> None:
-        """More weight to points that are too far off."""
+        """More weight to points that are too far off, and to nodes that change too much."""
         for one, weight, off in zip(self._moments, self._weights, self._off, strict=True):
-            weight *= np.maximum(np.abs(off) / one.near_enough_mm, np.float32(1))
+            more = np.maximum(np.abs(off) / one.near_enough_mm, np.float32(1))
+            weight *= more**HELD_POWER if one.sheet is None else more
             np.minimum(weight, np.float32(MOST_WEIGHT), out=weight)
 
     def _look(self) -> None:
