@@ -79,10 +79,10 @@ than a surface is ever off."""
 HELD, HELD_WITHIN = 0.1, 1.0
 """Weight of a node's squared change beside the squared distance of one point, and by how many
 spacings nodes are held. More of either costs the zero more between nodes and phases."""
-HELD_NEAR, HELD_SHARE, HELD_POWER = 0.15, 0.65, 4
+HELD_NEAR, HELD_SHARE, HELD_POWER = 0.15, 0.8, 8
 """A node whose distance changes by less than this share of the grid's spacing, or of that distance,
-gets no more weight: a node that comes to lie on the other side changes by all of it. One that
-changes by more gets more, by this power of how many times as much it is: a few rounds must do."""
+gets no more weight. One that comes to lie on the other side changes by all of it, and a few rounds
+must do: weights grow by this power of how many times as much it is."""
 
 
 @dataclass(frozen=True, slots=True)
