@@ -19,6 +19,7 @@ from pipeline.field import BakeSettings, Fixture, ForceField, surface_fit
 from pipeline.field.bake import SurfaceSeries, bake_field
 from pipeline.field.certificate import BAND_MM
 from pipeline.field.distance import distance_of_closed
+from pipeline.field.fit_kernels import gather, room
 from pipeline.field.motion import Motion, halfway
 from pipeline.field.spline import space_coefficients
 from pipeline.field.surface_fit import _asked, _Sheet, _Spread, fit_to_surface
@@ -342,6 +343,17 @@ def test_no_point_asks_for_a_node_beyond_the_grids_end(nodes):
     assert middle.max() == nodes - 2
     # What lies farther within than rounding may matter is left.
     assert len(held) >= np.count_nonzero((ends >= 0.5) & (ends < nodes - 1.502))
+
+
+@pytest.mark.parametrize("past", [4e-6, 1e-3, 0.3])
+def test_places_that_ask_coefficients_which_no_point_asks_are_told_by_the_least_of_weights(past):
+    """The farthest of 27 is unknown, and weighs past^6 / 8; 4e-6 is a step of single precision."""
+    layer = room((44, 44, 44))
+    layer[:] = 0
+    layer[42, 42, 42] = surface_fit.UNKNOWN
+    found = np.empty(1, dtype=np.float32)
+    gather(layer, np.full((1, 3), 40.5 + past, dtype=np.float32), found)
+    assert found[0] > 100
 
 
 @pytest.mark.parametrize("off_mm", 10.0 ** np.array([-23.75, -22.5, -22]))
