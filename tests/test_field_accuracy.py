@@ -22,7 +22,8 @@ from pipeline.field.distance import distance_of_closed
 from pipeline.field.fit_kernels import gather, room
 from pipeline.field.motion import Motion, halfway
 from pipeline.field.spline import space_coefficients
-from pipeline.field.surface_fit import _asked, _Sheet, _Spread, fit_to_surface
+from pipeline.field.surface_fit import _asked, fit_to_surface
+from pipeline.field.surface_points import Sheet, Spread
 from pipeline.field.verify import verify_field
 from pipeline.geometry import Grid, MovingSurface, Surface
 from pipeline.own_surfaces import bake_own_surfaces, measure_field
@@ -336,8 +337,8 @@ def test_no_point_asks_for_a_node_beyond_the_grids_end(nodes):
     points[:, 1] = ends
     vertices = np.column_stack([points, np.zeros(len(ends))]).astype(np.float32)
     each = np.repeat(np.arange(len(ends))[:, None], 3, axis=1)
-    spread = _Spread(each, np.tile(np.float32([1, 0, 0]), (len(ends), 1)))
-    held, _ = _asked(_Sheet(0.0, vertices, spread, spread), spread, (nodes,) * 3, 1.0)
+    spread = Spread(each, np.tile(np.float32([1, 0, 0]), (len(ends), 1)))
+    held, _ = _asked(Sheet(0.0, vertices, spread, spread), spread, (nodes,) * 3, 1.0)
     middle = (held + np.float32(0.5)).astype(int)
     assert middle.min() == 1
     assert middle.max() == nodes - 2

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -31,32 +31,19 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.field.fit_kernels import carry, gather, mix, room, scatter, share, touch
-from pipeline.field.motion import BeatingSurface, Motion, between, is_gap
+from pipeline.field.fit_kernels import gather, mix, room, scatter, share, touch
+from pipeline.field.motion import BeatingSurface
 from pipeline.field.spline import node_values, phase_weights, timeline
+from pipeline.field.surface_points import Sheet, Spread, sheets_of
 from pipeline.field.threads import processors
 from pipeline.geometry import (
     Float,
     Float32,
     Grid,
-    Integer,
-    Surface,
-    area_vectors,
-    spread_over_triangle,
 )
 
 T = TypeVar("T")
 
-MOMENTS_A_PHASE = 3
-POINTS_A_CELL = 2.0
-"""Points of the surface for each square of the grid's spacing, one for each triangle at least,
-beside vertices."""
-LOOKED_A_CELL, LOOKED_A_SPACING = 6.0, 2.0
-"""Places of the surface that are looked at for each square of the grid's spacing, and for each
-spacing along an edge; one for each triangle and edge at least."""
-ENOUGH_A_CELL = 5.0
-"""Of a mesh with many more vertices, edges or triangles for each square of the grid's spacing some
-are taken."""
 LOOK_BEFORE = 2, 5, 8, 10
 """Rounds before which places are looked at; those that are too far off are points from then on."""
 DAMPING = 0.06
@@ -65,9 +52,6 @@ NEAR_ENOUGH = 0.035
 """A point that is nearer to the spline's zero than this share of the grid's spacing gets no more
 weight: to bring it nearer still would cost the gradient about it more than it is worth. One
 whose own place is less sure than that need come no nearer than it is sure."""
-FEW_PHASES = 16
-"""With fewer, what the vertices' spline does not know costs the gradient more than its zero gains;
-with more it follows the heart as closely as the field can."""
 MOST_WEIGHT = 500.0
 MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
@@ -86,64 +70,6 @@ must do: weights grow by this power of how many times as much it is."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Spread:
-    """Material points of a mesh."""
-
-    corners: Integer
-    """``(n, 3)`` vertex numbers."""
-
-    shares: Float32
-    """``(n, 3)`` of the corners."""
-
-    @classmethod
-    def points(cls, surface: Surface, step_mm: float, first: int) -> _Spread:
-        """What the fit begins with: vertices, which stand out most, and points of all triangles."""
-        inside = _over_triangles(surface, step_mm, POINTS_A_CELL, first)
-        corners = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
-        corners = _some(corners, surface, step_mm)
-        return cls._of(inside, cls(corners, np.full(corners.shape, 1 / 3, dtype=np.float32)))
-
-    @classmethod
-    def looked_at(cls, surface: Surface, step_mm: float, first: int) -> _Spread:
-        """More places, of triangles and edges."""
-        inside = _over_triangles(surface, step_mm, LOOKED_A_CELL, first)
-        edges = _some(_edges(surface.triangles), surface, step_mm)
-        ends_mm = surface.vertices_mm[edges]
-        length = np.linalg.norm(ends_mm[:, 1] - ends_mm[:, 0], axis=1) / step_mm
-        counts = np.maximum(1, np.round(LOOKED_A_SPACING * length)).astype(int)
-        share = (_numbered(counts) + 1) / np.repeat(counts + 1, counts)
-        corners = np.repeat(edges, counts, axis=0)[:, [0, 1, 1]]
-        shares = np.stack([1 - share, share, np.zeros_like(share)], axis=1)
-        return cls._of(inside, cls(corners, shares.astype(np.float32)))
-
-    @classmethod
-    def _of(cls, one: _Spread, other: _Spread) -> _Spread:
-        corners = np.concatenate([one.corners, other.corners])
-        return cls(corners, np.concatenate([one.shares, other.shares]))
-
-    def carried(self, values: Float32) -> Float32:
-        """What vertices have, ``(vertex, 4)``, at the points ``(n, 4)``."""
-        found = np.empty((len(self.corners), 4), dtype=np.float32)
-        carry(values, self.corners, self.shares, found)
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Sheet:
-    """The surface at one phase."""
-
-    phase: float
-    vertices: Float32
-    """``(vertex, 4)``: x, y, z counted in nodes, and by about how many mm each may be off."""
-
-    points: _Spread
-    """Where the distance is to be zero."""
-
-    looked_at: _Spread
-    """And where it is looked at."""
-
-
-@dataclass(frozen=True, slots=True)
 class _Moment:
     """Points at which the distance is to be zero, all at one phase."""
 
@@ -159,7 +85,7 @@ class _Moment:
     near_enough_mm: Float32
     """``(point,)``: one that is nearer to the spline's zero gets no more weight."""
 
-    sheet: _Sheet | None = None
+    sheet: Sheet | None = None
     """Where more places are to be looked at; None where points are nodes, whose distance is to stay
     as it is instead of coming to zero."""
 
@@ -199,7 +125,7 @@ def fit_to_surface(
     if rounds == 0:
         return 0.0
     step_mm = min(grid.spacing_mm)
-    sheets = list(_sheets(moving, phases, grid))
+    sheets = list(sheets_of(moving, phases, grid))
     low, high = _box([one.vertices for one in sheets], grid)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     shape = splines[0][box].shape
@@ -232,79 +158,8 @@ def fit_to_surface(
     return float(np.abs(change).max())
 
 
-def _sheets(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[_Sheet]:
-    """The surface at some moments: at stored phases, and where vertices correspond between them,
-    but in no gap: what a spline of few phases cannot follow there, it would make up for at the
-    phases beside it."""
-    step_mm = min(grid.spacing_mm)
-
-    def placed(vertices_mm: Float, unsure_mm: Float) -> Float32:
-        nodes = (vertices_mm - grid.origin_mm) / np.array(grid.spacing_mm)
-        return np.column_stack([nodes, unsure_mm]).astype(np.float32)
-
-    motion = Motion.of(moving)
-    if motion is None:
-        for index, phase in enumerate(phases.tolist()):
-            surface = moving.at(index)
-            vertices = placed(surface.vertices_mm, np.zeros(len(surface.vertices_mm)))
-            yield _Sheet(phase, vertices, *_spreads(surface, step_mm, index))
-        return
-    spreads = [_spreads(moving.at(0), step_mm, number) for number in range(MOMENTS_A_PHASE)]
-    moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
-    moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
-    unsure_of_each_mm = np.zeros(motion.places_mm.shape[:2])
-    if len(phases) < FEW_PHASES:
-        unsure_of_each_mm = motion.unsure_mm()
-    for row, unsure_mm in zip(moments.tolist(), unsure_of_each_mm, strict=True):
-        for number, (phase, spread) in enumerate(zip(row, spreads, strict=True)):
-            if np.isfinite(phase):
-                vertices_mm = motion.at(phase).vertices_mm
-                yield _Sheet(phase, placed(vertices_mm, unsure_mm * (number > 0)), *spread)
-
-
-def _spreads(surface: Surface, step_mm: float, number: int) -> tuple[_Spread, _Spread]:
-    """Points and places to look at: other ones for each number."""
-    return (
-        _Spread.points(surface, step_mm, number),
-        _Spread.looked_at(surface, step_mm, number),
-    )
-
-
-def _over_triangles(surface: Surface, step_mm: float, a_cell: float, number: int) -> _Spread:
-    """So many points for each square of the grid's spacing, one for each triangle at least."""
-    some = _some(np.arange(len(surface.triangles)), surface, step_mm)
-    counts = np.maximum(1, np.ceil(a_cell * _cells(surface, step_mm)[some] - 0.5)).astype(int)
-    total = int(counts.sum())
-    shares = spread_over_triangle((number + 1) * total)[number * total :]
-    chosen = np.repeat(some, counts)
-    return _Spread(surface.triangles[chosen], shares.astype(np.float32))
-
-
-def _some(ones: Integer, surface: Surface, step_mm: float) -> Integer:
-    """Vertices, edges or triangles; some of them where the mesh is much finer than the grid."""
-    enough = math.ceil(ENOUGH_A_CELL * _cells(surface, step_mm).sum())
-    return ones[:: max(1, len(ones) // enough)]
-
-
-def _cells(surface: Surface, step_mm: float) -> Float:
-    """Squares of the grid's spacing that each triangle would fill, ``(triangle,)``."""
-    twice_mm2 = np.linalg.norm(area_vectors(surface.vertices_mm[surface.triangles]), axis=1)
-    return np.asarray(twice_mm2 / 2 / step_mm**2)
-
-
-def _numbered(counts: Integer) -> Integer:
-    """From 0 for each of them up to its count."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-
-
-def _edges(triangles: Integer) -> Integer:
-    """``(n, 2)`` vertex numbers, each edge once."""
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]])
-    return np.unique(np.sort(sides), axis=0)
-
-
 def _asked(
-    sheet: _Sheet, spread: _Spread, shape: tuple[int, ...], step_mm: float
+    sheet: Sheet, spread: Spread, shape: tuple[int, ...], step_mm: float
 ) -> tuple[Float32, Float32]:
     """Points in the box, ``(n, 3)``, and how near each has to come, mm ``(n,)``."""
     points = spread.carried(sheet.vertices)
