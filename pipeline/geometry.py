@@ -96,13 +96,15 @@ def nearest_phase(phases: Float, phase: float) -> int:
     return int(np.abs((phases - phase + 0.5) % 1 - 0.5).argmin())
 
 
-def spread_over_triangle(count: int) -> Float:
-    """Shares ``(count, 3)`` of a triangle's corners that cover it evenly, the same every time.
+def spread_over_triangle(count: int, first: int = 0) -> Float:
+    """Shares ``(count, 3)`` of a triangle's corners that cover it evenly, the same every time:
+    those of an endless row from number ``first`` on.
 
     Steps of the inverse plastic number and its square, even in the square (M. Roberts, "The
     unreasonable effectiveness of quasirandom sequences", 2018), folded into the triangle.
     """
-    u, v = (np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532) % 1).T
+    numbers = np.arange(first, first + count)[:, None]
+    u, v = (numbers * (0.7548776662466927, 0.5698402909980532) % 1).T
     u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))
     return np.stack([1 - u - v, u, v], axis=1)
 

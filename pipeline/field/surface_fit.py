@@ -45,7 +45,8 @@ from pipeline.geometry import (
 T = TypeVar("T")
 
 LOOK_BEFORE = 2, 5, 8, 10
-"""Rounds before which places are looked at; those that are too far off are points from then on."""
+"""Rounds before which places are looked at; those that are too far off, but by less than a spacing,
+become points, once more each time."""
 DAMPING = 0.06
 """Weight of a coefficient's squared change beside the squared distance of one point."""
 NEAR_ENOUGH = 0.035
@@ -57,9 +58,6 @@ MOST_CHANGE = 1.0
 """No coefficient moves by more than so many spacings: where two rims share their nodes, no change
 suits both, and what little it gains there it would cost many times over beside them."""
 STEPS_A_ROUND = 4
-UNKNOWN = 1e38
-"""Stands for coefficients that no point asks: whoever asks one by the least of weights finds more
-than a surface is ever off."""
 HELD, HELD_WITHIN = 0.1, 1.0
 """Weight of a node's squared change beside the squared distance of one point, and by how many
 spacings nodes are held. More of either costs the zero more between nodes and phases."""
@@ -144,6 +142,10 @@ def fit_to_surface(
     touched = np.zeros(shape, dtype=bool)
     for moment in moments:
         touch(touched, moment.nodes)
+        # Places at an edge may ask for nodes that no point of the triangles beside it does.
+        if moment.sheet is not None:
+            places, _ = _asked(moment.sheet, moment.sheet.looked_at, shape, step_mm)
+            touch(touched, places)
     moments += _held([one[box] for one in splines], phases, touched, step_mm)
     shell = np.flatnonzero(touched).astype(np.uint32)
     near = np.stack([one[box].ravel()[shell] for one in splines])
@@ -207,15 +209,14 @@ class _Layers(threading.local):
     """What each thread has for itself, ``(z, y, x)``."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.mixed, self.acting, self.looked_at = room(shape), room(shape), room(shape)
-        self.looked_at.fill(UNKNOWN)
+        self.mixed, self.acting = room(shape), room(shape)
 
 
 class _Fit:
     """The change that brings coefficients to zero at all points.
 
-    Coefficients ``(phase, n)`` are those that some point asks, a shell about the surface: ``shell``
-    are their places in an array of ``shape`` ``(z, y, x)``, flattened.
+    Coefficients ``(phase, n)`` are those that some point or place asks, a shell about the surface:
+    ``shell`` are their places in an array of ``shape`` ``(z, y, x)``, flattened.
     """
 
     def __init__(
@@ -279,18 +280,18 @@ class _Fit:
         coefficients = self._coefficients + self._change
 
         def look(number: int) -> None:
-            one, layers = self._moments[number], self._layers
+            one, layer = self._moments[number], self._layers.mixed
             if one.sheet is None:
                 return
-            shape = layers.mixed.shape
+            shape = layer.shape
             nodes, near_enough_mm = _asked(one.sheet, one.sheet.looked_at, shape, self._spacing_mm)
-            mix(coefficients, one.interval, one.weights, layers.looked_at, self._shell)
-            found = self._gathered(layers.looked_at, nodes)
+            mix(coefficients, one.interval, one.weights, layer, self._shell)
+            found = self._gathered(layer, nodes)
             off_mm = np.abs(found)
             missed = (off_mm > near_enough_mm) & (off_mm < MOST_CHANGE * self._spacing_mm)
             nodes, near_enough_mm, found = nodes[missed], near_enough_mm[missed], found[missed]
-            mix(self._change, one.interval, one.weights, layers.mixed, self._shell)
-            moved = self._gathered(layers.mixed, nodes)
+            mix(self._change, one.interval, one.weights, layer, self._shell)
+            moved = self._gathered(layer, nodes)
             more = nodes, near_enough_mm, moved - found, -found, self._first_weights(near_enough_mm)
             before = self._before[number], self._off[number], self._weights[number]
             had = one.nodes, one.near_enough_mm, *before

@@ -53,15 +53,18 @@ class Spread:
     def points(cls, surface: Surface, step_mm: float, number: int) -> Spread:
         """What a fit begins with: vertices, which stand out most, and points of all triangles."""
         inside = _over_triangles(surface, step_mm, POINTS_A_CELL, number)
-        corners = np.repeat(np.arange(len(surface.vertices_mm))[:, None], 3, axis=1)
-        corners = _some(corners, surface, step_mm)
+        cells, at = _cells(surface, step_mm), surface.triangles.ravel()
+        some = _some(_summed(at, np.repeat(cells / 3, 3), len(surface.vertices_mm)))
+        corners = np.repeat(some[:, None], 3, axis=1)
         return cls._of(inside, cls(corners, np.full(corners.shape, 1 / 3, dtype=np.float32)))
 
     @classmethod
     def looked_at(cls, surface: Surface, step_mm: float, number: int) -> Spread:
         """More places, of triangles and edges."""
         inside = _over_triangles(surface, step_mm, LOOKED_A_CELL, number)
-        edges = _some(_edges(surface.triangles), surface, step_mm)
+        edges, side = _edges(surface.triangles)
+        cells = np.tile(_cells(surface, step_mm) / 3, 3)
+        edges = edges[_some(_summed(side, cells, len(edges)))]
         ends_mm = surface.vertices_mm[edges]
         length = np.linalg.norm(ends_mm[:, 1] - ends_mm[:, 0], axis=1) / step_mm
         counts = np.maximum(1, np.round(LOOKED_A_SPACING * length)).astype(int)
@@ -137,18 +140,26 @@ def _spreads(surface: Surface, step_mm: float, number: int) -> tuple[Spread, Spr
 
 def _over_triangles(surface: Surface, step_mm: float, a_cell: float, number: int) -> Spread:
     """So many points for each square of the grid's spacing, one for each triangle at least."""
-    some = _some(np.arange(len(surface.triangles)), surface, step_mm)
-    counts = np.maximum(1, np.ceil(a_cell * _cells(surface, step_mm)[some] - 0.5)).astype(int)
+    cells = _cells(surface, step_mm)
+    some = _some(cells)
+    counts = np.maximum(1, np.ceil(a_cell * cells[some] - 0.5)).astype(int)
     total = int(counts.sum())
-    shares = spread_over_triangle((number + 1) * total)[number * total :]
+    shares = spread_over_triangle(total, number * total)
     chosen = np.repeat(some, counts)
     return Spread(surface.triangles[chosen], shares.astype(np.float32))
 
 
-def _some(ones: Integer, surface: Surface, step_mm: float) -> Integer:
-    """Vertices, edges or triangles; some of them where the mesh is much finer than the grid."""
-    enough = math.ceil(ENOUGH_A_CELL * _cells(surface, step_mm).sum())
-    return ones[:: max(1, len(ones) // enough)]
+def _some(cells: Float) -> Integer:
+    """Numbers of vertices, edges or triangles that have so many squares of the grid's spacing about
+    them; of a mesh that is much finer than the grid some, where it is."""
+    if len(cells) < 2 * math.ceil(ENOUGH_A_CELL * cells.sum()):
+        return np.arange(len(cells))
+    due = np.minimum(1, ENOUGH_A_CELL * cells)
+    return np.flatnonzero((np.diff(np.floor(np.cumsum(due)), prepend=0) > 0) | (due == 1))
+
+
+def _summed(numbers: Integer, cells: Float, count: int) -> Float:
+    return np.asarray(np.bincount(numbers, cells, count), dtype=float)
 
 
 def _cells(surface: Surface, step_mm: float) -> Float:
@@ -162,7 +173,8 @@ def _numbered(counts: Integer) -> Integer:
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _edges(triangles: Integer) -> Integer:
-    """``(n, 2)`` vertex numbers, each edge once."""
+def _edges(triangles: Integer) -> tuple[Integer, Integer]:
+    """``(n, 2)`` vertex numbers, each edge once, and the edge of each side of triangles."""
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, ::2]])
-    return np.unique(np.sort(sides), axis=0)
+    edges, side = np.unique(np.sort(sides), axis=0, return_inverse=True)
+    return edges, side.ravel()
