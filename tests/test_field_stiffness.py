@@ -7,9 +7,10 @@ import pytest
 from field_shapes import torus_distance
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from pipeline.field import Fixture, ForceField
-from pipeline.field.certificate import rate_bound_n_per_mm
+from pipeline.field.certificate import rate_bound_n_per_mm, spline_limits
 from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
 from pipeline.field.spline import space_coefficients
 from pipeline.field.stiffness import field_rates_n_per_m
@@ -212,7 +213,58 @@ def test_about_the_medial_axis_a_field_keeps_to_its_bound(tmp_path, shape):
     field = write_field(tmp_path / "f.zarr", distance, fixture)
     points_mm = np.random.default_rng(6).uniform(-18, 18, (100_000, 3))
     found = field_rates_n_per_m(field, points_mm, np.zeros(1), "f")
-    bound = 1000 * rate_bound_n_per_mm(fixture, SPACING_MM)
+    bound = 1000 * rate_bound_n_per_mm(fixture, *spline_limits(field, "s"))
     # It drives apart faster than any spring of the law holds.
     assert bound / 8 < -found.min() <= bound
     assert found.max() <= bound
+
+
+def points_in_space(points_mm: Float) -> Float:
+    """The distance from 600 random points: medial axes as near to each other as nodes are."""
+    middles_mm = np.random.default_rng(7).uniform(-24, 24, (600, 3))
+    return np.asarray(cKDTree(middles_mm).query(points_mm)[0]) - 1
+
+
+def comb(points_mm: Float) -> Float:
+    """Plates 3 mm apart, aslant."""
+    return np.abs((points_mm.sum(axis=-1) / math.sqrt(3)) % 3 - 1.5) - 0.75
+
+
+def checkerboard(points_mm: Float) -> Float:
+    """Half a spacing more or less from node to node: no distance changes faster between nodes."""
+    odd = np.round((points_mm + 24) / SPACING_MM).sum(axis=-1) % 2
+    return (odd - 0.5) * SPACING_MM
+
+
+@pytest.mark.parametrize("distance", [ball, slab, ring, comb, points_in_space, checkerboard])
+def test_nowhere_does_a_force_change_faster_than_stated(tmp_path, distance):
+    """In any direction, where medial axes lie near each other, too."""
+    fixture = law(1, delta_mm=0.5)
+    field = write_field(tmp_path / "f.zarr", distance, fixture)
+    longest, turning_per_mm = spline_limits(field, "s")
+    step_mm = 1e-3
+    rng = np.random.default_rng(8)
+    here = rng.uniform(-22, 22, (200_000, 3))
+    way = rng.normal(size=here.shape)
+    there = here + step_mm * way / np.linalg.norm(way, axis=1, keepdims=True)
+    gradient = field.gradient(here, 0.0)
+    turned_per_mm = np.linalg.norm(field.gradient(there, 0.0) - gradient, axis=1) / step_mm
+    assert np.linalg.norm(gradient, axis=1).max() <= longest
+    # The largest of each derivative, wherever it is, and of random places and ways the best met.
+    assert turning_per_mm / (8 if distance is checkerboard else 4) < turned_per_mm.max()
+    assert turned_per_mm.max() <= turning_per_mm
+    change_n = np.linalg.norm(field.force_n(there, 0.0) - field.force_n(here, 0.0), axis=1)
+    assert 0.1 < change_n.max() / step_mm <= rate_bound_n_per_mm(fixture, longest, turning_per_mm)
+
+
+def test_the_stated_rate_is_that_of_the_coefficients(tmp_path):
+    """Truth: the quadratic spline doubles, along each axis, what changes sign from node to node
+    (Unser 1999), so the coefficients of a checkerboard are 8 times half a spacing, of either sign.
+    """
+    field = write_field(tmp_path / "f.zarr", checkerboard, law(2))
+    longest, turning_per_mm = spline_limits(field, "s")
+    assert longest == pytest.approx(math.sqrt(3) * 8)
+    assert turning_per_mm == pytest.approx(3 * 16 / SPACING_MM)
+    assert rate_bound_n_per_mm(law(2), 1.5, 4.0) == pytest.approx(
+        2 * 2.0 * 4.0 + 1.5 * law(2).stiffness_n_per_m / 1000
+    )

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,11 +76,16 @@ def certify(
             for step in steps:
                 step.result()
             progress()
+        limits = dict(
+            zip(distances, pool.map(partial(spline_limits, volume), distances), strict=True)
+        )
     structures = {
         name: _over_phases(found) | _drift(volume, name, surfaces[name])
         for name, found in distances.items()
     }
-    fixtures = {name: one.result() for name, one in forces.items()}
+    fixtures = {
+        name: one.result(*limits[volume.fixtures[name].structure]) for name, one in forces.items()
+    }
     return {
         **_largest(structures),
         **_largest(fixtures),
@@ -90,15 +96,33 @@ def certify(
     }
 
 
-def rate_bound_n_per_mm(fixture: Fixture, spacing_mm: float) -> float:
+def rate_bound_n_per_mm(fixture: Fixture, longest: float, turning_per_mm: float) -> float:
     """The stated bound of how fast a force changes with place, on the medial axis too, N/mm.
 
     The direction is the gradient projected onto a ball and divided by its radius 1/2, which turns
-    no faster than twice the gradient does. Across a kink the distances of three nodes in a row have
-    a second difference of 2 spacings at most, and the spline's coefficients of twice that, so its
-    slope changes by 4 / spacing. To this comes the law's own stiffness.
+    no faster than twice the gradient does; the size follows the law's slope times the gradient's
+    length. What limits both is from `spline_limits`.
     """
-    return 8 * fixture.f_max_n / spacing_mm + fixture.stiffness_n_per_m / 1000
+    return 2 * fixture.f_max_n * turning_per_mm + fixture.stiffness_n_per_m / 1000 * longest
+
+
+def spline_limits(volume: ForceField, structure: str) -> tuple[float, float]:
+    """Limits of a structure's gradient anywhere, in any direction: of its length, and of how fast
+    it changes with place, 1/mm.
+
+    Everywhere a first or second derivative of a quadratic spline is a mean of the differences of
+    its coefficients between neighbours along these axes (de Boor, A Practical Guide to Splines,
+    1978, chapter X), in time as well. So no derivative is larger than the largest difference, and
+    the matrix of second derivatives is no larger than that of the largest ones.
+    """
+    from pipeline.field.steps import largest_differences
+
+    first, second = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
+    for index in range(len(volume.phases)):
+        largest_differences(volume.stored_coefficients(structure, index), first, second)
+    spacing_mm = np.array(volume.grid.spacing_mm)
+    turning = np.linalg.eigvalsh(second / np.outer(spacing_mm, spacing_mm))
+    return float(np.linalg.norm(first / spacing_mm)), float(turning[-1])
 
 
 def allowed_errors(bounds: Bounds, spacing_mm: float) -> dict[str, float]:
@@ -369,12 +393,14 @@ class _ForceSteps:
         longest = float(np.maximum(length, there)[clear].max(initial=0.0))
         return 1000 * float(change_n.max(initial=0.0)) / STEP_MM, longest
 
-    def result(self) -> dict[str, Any]:
-        """The largest steps over space and, the cycle closed, over time."""
+    def result(self, longest: float, turning_per_mm: float) -> dict[str, Any]:
+        """The largest steps over space and, the cycle closed, over time; what limits the gradient
+        is that of `spline_limits`."""
         from pipeline.field.steps import largest_change
 
         changes_n = [*self._changes_n, float(largest_change(self._before_n, self._first_n))]
         spacing_mm = np.array(self._volume.grid.spacing_mm)
+        bound_n_per_mm = rate_bound_n_per_mm(self._fixture, longest, turning_per_mm)
         found = self._sampled
         steps, slopes = [one.step_n for one in found], [one.stiffness_n_per_m for one in found]
         lates = [one.late_n for one in found]
@@ -387,7 +413,7 @@ class _ForceSteps:
             "force_change_max_n_per_ms": None if change_n is None else max(change_n) / STEP_MS,
             "force_step_max_n_per_0_1_mm": max(steps),
             "force_rate_max_n_per_mm": max(steps) / STEP_MM,
-            "force_rate_bound_n_per_mm": rate_bound_n_per_mm(self._fixture, spacing_mm.min()),
+            "force_rate_bound_n_per_mm": bound_n_per_mm,
             "stiffness_measured_n_per_m": max(slopes),
             "stiffness_n_per_m": self._fixture.stiffness_n_per_m,
             **self._holding(),

@@ -31,8 +31,8 @@ INTERPOLATION = {
     "force": "-f_max * f(q) * direction, f and the direction from the interpolated distance",
     "direction": "gradient / max(length of the gradient, 0.5): a unit vector except near the "
     "medial axis, where it passes continuously through zero",
-    "rate": "on the medial axis the force passes through zero without a step, and changes with "
-    "place by at most 8 f_max / spacing + stiffness (N/mm), accuracy's force_rate_bound_n_per_mm",
+    "rate": "on the medial axis the force passes through zero without a step; anywhere, and in any "
+    "direction, it changes with place by at most accuracy's force_rate_bound_n_per_mm",
 }
 
 
@@ -230,7 +230,7 @@ LEAST_PHASE_STEP = 1e-3
 
 
 def require_phases(phases: list[float], where: str) -> None:
-    """Raise ValueError unless phases rise within [0, 1)."""
+    """Raise ValueError unless phases rise within [0, 1), by `LEAST_PHASE_STEP` or more each."""
     inside = all(0 <= phase < 1 for phase in phases)
     if not phases or not inside or any(b <= a for a, b in itertools.pairwise(phases)):
         raise ValueError(f"{where} must rise within [0, 1), got {phases}")

@@ -66,8 +66,8 @@ class ForceField:
 
     The direction of the force is ``g / max(|g|, 0.5)`` for the gradient g: a unit vector except
     near the medial axis, where two parts of the surface are equally near; there the force passes
-    continuously through zero, along an axis of the grid by no more than 8 f_max / spacing plus
-    the law's stiffness.
+    continuously through zero, and nowhere does it change faster with place than the certificate's
+    ``force_rate_bound_n_per_mm``.
 
     Questions of many points are shared among the processors; the answers do not depend on how
     many there are. ``force_at`` and ``distance_at`` answer for one point at the least cost.
@@ -191,15 +191,38 @@ class ForceField:
         return self._metadata.source
 
     def contains(self, points_mm: npt.ArrayLike) -> Mask:
-        """Which of ``(n, 3)`` points lie in the grid."""
+        """Which of ``(n, 3)`` points lie in the grid, its boundary included.
+
+        Raises
+        ------
+        InputError
+            When the shape is wrong or a value is not finite.
+        """
         points = as_points(points_mm)
         require_finite(points)
         inside = (points >= self._grid.origin_mm) & (points <= self._grid.upper_mm)
         return np.asarray(inside.all(axis=1))
 
     def stored_distance_mm(self, structure: str, index: int) -> Float32:
-        """The stored ``(z, y, x)`` distances of one phase, mapped, not copied."""
+        """The stored ``(z, y, x)`` distances of one phase, mapped, not copied.
+
+        Raises
+        ------
+        InputError
+            When the structure is unknown.
+        """
         return self._distances[self._structure(structure)][index]
+
+    def stored_coefficients(self, structure: str, index: int) -> Float32:
+        """The spline's ``(z, y, x)`` coefficients of one phase, mapped, not copied.
+
+        Raises
+        ------
+        InputError
+            When the structure is unknown.
+        """
+        part = self._metadata.structures[self._structure(structure)]
+        return map_phase(self._path / part.spline, index, self._grid)
 
     def distance_mm(
         self, points_mm: npt.ArrayLike, phase: npt.ArrayLike, structure: str | None = None
@@ -229,13 +252,25 @@ class ForceField:
     def gradient(
         self, points_mm: npt.ArrayLike, phase: npt.ArrayLike, structure: str | None = None
     ) -> Float:
-        """Gradient of ``distance_mm`` at ``(n, 3)`` points: ``(n, 3)``, without unit."""
+        """Gradient of ``distance_mm`` at ``(n, 3)`` points: ``(n, 3)``, without unit.
+
+        Raises
+        ------
+        InputError
+            As there.
+        """
         return self._sample(points_mm, phase, self._structure(structure))[1]
 
     def potential(
         self, points_mm: npt.ArrayLike, phase: npt.ArrayLike, fixture: str | None = None
     ) -> Float:
-        """Potential of a fixture at ``(n, 3)`` points: ``(n,)`` in [0, 1)."""
+        """Potential of a fixture at ``(n, 3)`` points: ``(n,)`` in [0, 1], rounded to 1 far off.
+
+        Raises
+        ------
+        InputError
+            As in ``distance_mm``.
+        """
         law = self._fixture(fixture)
         distance_mm, _ = self._sample(points_mm, phase, law.structure)
         height: Float = potential(offence(distance_mm, law.side_code), law.resolved_delta_mm, law.m)
@@ -247,6 +282,11 @@ class ForceField:
         """Force of a fixture on a tool at ``(n, 3)`` points: ``(n, 3)`` newtons.
 
         ``-f_max f(q) direction``, with the direction in which the potential rises.
+
+        Raises
+        ------
+        InputError
+            As in ``distance_mm``.
         """
         from pipeline.field.batches import sample_force
 
@@ -320,7 +360,8 @@ class ForceField:
         """Force and torque on a whole tool: the mean of the field's force over its length.
 
         A tool thus feels no more than ``f_max``. Its lines are divided where the field demands
-        it, until dividing once more would change the force by less than ``bound_n``.
+        it, until dividing once more would change the force by less than ``bound_n``, or a stretch
+        has been divided eight times.
 
         Parameters
         ----------
@@ -338,8 +379,9 @@ class ForceField:
         Raises
         ------
         InputError
-            When the pose is not rigid, a number not finite, the fixture unknown, the tool longer
-            than 20 diagonals of the grid, or the field damaged.
+            When the tool is none, the pose is not rigid, a number not finite, the bound not above
+            0, the fixture unknown, the tool longer than 20 diagonals of the grid or so far from its
+            handle that the torque is no number, or the field damaged.
         """
         kernel = self._tool_force or self._load_tools()
         phase, bound_n = two_floats(phase, bound_n)
