@@ -70,9 +70,20 @@ def test_a_robots_strict_build_takes_the_headers(tmp_path, compiler):
     if shutil.which(compiler) is None:
         pytest.skip(f"needs {compiler}")
     standard = "-std=c++17" if "++" in compiler else "-std=c99"
-    strict = ["-Wconversion", "-Wshadow", "-O0", standard]
+    # Windows' own header makes nothing of two words, and is included before ours.
+    strict = ["-Wconversion", "-Wshadow", "-O0", standard, "-Dfar=", "-Dnear="]
     server = EXAMPLE.with_name("server.c")
     build(server, tmp_path / "program", *strict, compiler=compiler)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "g++"])
+def test_compiles_for_windows(tmp_path, compiler):
+    compiler = f"x86_64-w64-mingw32-{compiler}"
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}")
+    standard = "-std=c++11" if "++" in compiler else "-std=c99"
+    server = EXAMPLE.with_name("server.c")
+    build(server, tmp_path / "program.exe", standard, "-include", "windows.h", compiler=compiler)
 
 
 def test_a_million_answers_are_pythons(path, program):

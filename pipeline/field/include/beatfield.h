@@ -58,7 +58,7 @@ typedef enum {
     BF_WRONG_SIZE,   /* a file's size is not what the description says; or a batch's or tool's is none */
     BF_DAMAGED,      /* a file is not what the manifest says, or a value in it is not finite */
     BF_NO_MEMORY,    /* malloc or mmap refused */
-    BF_CANNOT_LOCK,  /* mlock refused (ulimit -l); pages are in memory, but may be paged out */
+    BF_CANNOT_LOCK,  /* mlock refused (ulimit -l), or Windows; pages are in memory, but may be paged out */
     BF_NO_SUCH_NAME, /* number of a structure or fixture that is not there */
     BF_NOT_FINITE,   /* a coordinate or phase is not a number, infinite, or too large to add up */
     BF_NOT_RIGID,    /* mr_from_tool is no rotation and shift */
@@ -112,9 +112,9 @@ bf_status bf_open(bf_field *field, const char *path);
 bf_status bf_verify(const char *path);
 
 /* Copy all values from the files into memory and keep them there: whatever becomes of the files after
- * that changes nothing. Where it fails with BF_CANNOT_LOCK they are copied all the same; with
- * BF_DAMAGED one is not finite, and a hand would feel a hole. Before the first question: it must not
- * run while a thread asks. */
+ * that changes nothing. Where it fails with BF_CANNOT_LOCK, as always on Windows, they are copied all
+ * the same; with BF_DAMAGED one is not finite, and a hand would feel a hole. Before the first question:
+ * it must not run while a thread asks. */
 bf_status bf_lock(bf_field *field);
 
 /* Give everything back; harmless twice. No thread may be asking any more. */
@@ -225,8 +225,8 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 
 #ifdef BEATFIELD_IMPLEMENTATION
 #undef BEATFIELD_IMPLEMENTATION
-#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
-#error "beatfield.h tells what is no number from what is one: compile without -ffast-math"
+#if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "beatfield.h tells what is no number from what is one: compile without -ffast-math or /fp:fast"
 #endif
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "beatfield.h reads stores as they are, which are little-endian"
@@ -237,10 +237,10 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #ifndef _WIN32
 #include <fcntl.h>
 #include <sys/mman.h>
-#include <sys/stat.h>
 #include <unistd.h>
 #ifndef O_DIRECTORY
 #error "include beatfield.h before other headers where it is implemented, or define _POSIX_C_SOURCE 200809L"
@@ -257,8 +257,10 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length);
 #endif
 #endif
 /* Where the compiler can make code for a processor that it only may meet, four nodes of a row are
- * read at a time if the processor can; BEATFIELD_PLAIN leaves that out. */
-#if defined(__GNUC__) && defined(__x86_64__) && !defined(BEATFIELD_PLAIN)
+ * read at a time if the processor can; BEATFIELD_PLAIN leaves that out, and so does GCC for Windows: the
+ * stack is aligned to 16 bytes there, and it writes as if it were to 32 (GCC bug 54412). */
+#if defined(__GNUC__) && defined(__x86_64__) && !defined(BEATFIELD_PLAIN) && \
+    (!defined(_WIN32) || defined(__clang__))
 #define BF__WIDE __attribute__((target("avx2,fma")))
 #include <immintrin.h>
 #endif
@@ -945,6 +947,15 @@ static FILE *bf__file(const bf__folder *folder, const char *name, size_t length)
     path[before + length] = 0;
 #ifdef _WIN32
     file = fopen(path, "rb");
+    /* Such names as COM1 are devices in every folder, and one never ends. */
+    if (file) {
+        struct _stat64 about;
+        if (_fstat64(_fileno(file), &about) != 0 || !(about.st_mode & _S_IFREG)) {
+            fclose(file);
+            file = NULL;
+            errno = EINVAL;
+        }
+    }
 #else
     {
         /* A pipe would let us wait for who writes into it, and a device never ends. */
@@ -1158,6 +1169,9 @@ static bf_status bf__open_as(bf_field *field, const bf__folder *folder, const ch
             status = bf__map(folder, name, field->bytes, &part->coefficients[k]);
         }
     }
+#ifdef _WIN32
+    field->copied = status == BF_OK;
+#endif
     return status;
 }
 
@@ -1244,6 +1258,9 @@ bf_status bf_lock(bf_field *field)
     for (n = 0; status != BF_NO_MEMORY && n < field->structures; n++)
         for (k = 0; k < field->phases; k++)
             if (mlock(field->structure[n].coefficients[k], field->bytes) != 0) status = BF_CANNOT_LOCK;
+#else
+    /* They were copied as they were opened, into memory that Windows may page out. */
+    status = BF_CANNOT_LOCK;
 #endif
     return status;
 }
@@ -1667,7 +1684,7 @@ static int bf__follow(const bf__batch *batch)
     enum { PAIRS = 64 };
     const bf_field *field = batch->field;
     size_t n;
-    int far = 0, pair, axis;
+    int apart = 0, pair, axis; /* windows.h makes nothing of the word far */
     for (pair = 0; pair < PAIRS; pair++) {
         double way = 0, beats;
         const double *point_mm;
@@ -1677,9 +1694,9 @@ static int bf__follow(const bf__batch *batch)
             way += fabs(point_mm[3 + axis] - point_mm[axis]) * field->per_mm[axis];
         beats = bf__when(batch, n + 1) - bf__when(batch, n);
         beats = fabs(beats - floor(beats + 0.5));
-        far += way > 4 || beats * field->phases > 2;
+        apart += way > 4 || beats * field->phases > 2;
     }
-    return far < PAIRS / 4;
+    return apart < PAIRS / 4;
 }
 
 /* Into which of the bins a question falls: by height first, then by phase. */

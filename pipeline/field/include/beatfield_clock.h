@@ -91,9 +91,9 @@ bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
 int bf_change_field(bf_clock *clock, double cycle_rr_s, double fade_per_s);
 
 /* An R peak became known, as a rule within clock.latency_s: the clock waits no longer for one that is
- * due. strange: its shape is unlike the others'. BF_NO_BEAT, and nothing changes, when it is no later
- * than the last, or more than 3 s after the latest time told by bf_now or by a beat: so far ahead it
- * was timed by another clock, or in another unit. */
+ * due. strange: its shape is unlike the others'. BF_NO_BEAT when it is no later than the last, or more
+ * than 3 s after the latest time told by bf_now or by a beat: so far ahead it was timed by another
+ * clock, or in another unit. Nothing changes then, but that bf_take_back has no beat to take back. */
 bf_beat_kind bf_beat(bf_clock *clock, double r_s, int strange);
 
 /* The last beat was none, as a P wave that its R followed: know what was known before it. To be told
@@ -124,8 +124,8 @@ double bf_to_cycle(double phase, double rr_s, double cycle_rr_s);
 
 #include <math.h>
 #include <string.h>
-#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
-#error "beatfield_clock.h tells what is no number from what is one: compile without -ffast-math"
+#if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "beatfield_clock.h tells what is no number from what is one: compile without -ffast-math or /fp:fast"
 #endif
 
 #ifdef __cplusplus
