@@ -111,7 +111,13 @@ def spread_over_triangle(count: int, first: int = 0) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Regular axis-aligned nodes in LPS millimetres."""
+    """Regular axis-aligned nodes in LPS millimetres.
+
+    Raises
+    ------
+    InputError
+        When an axis has fewer than two nodes, or a spacing is not positive.
+    """
 
     shape: tuple[int, int, int]
     """Number of nodes along z, y, x: the shape of the arrays that live here."""
@@ -153,7 +159,13 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A triangle mesh in LPS millimetres; normals point out of the body it encloses."""
+    """A triangle mesh in LPS millimetres; normals point out of the body it encloses.
+
+    Raises
+    ------
+    InputError
+        When a shape is wrong, or there is no triangle.
+    """
 
     vertices_mm: Float
     """``(n, 3)`` positions."""
@@ -193,7 +205,13 @@ def area_vectors(corners: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class MovingSurface:
-    """One surface through the beat: vertex i is the same material point in every phase."""
+    """One surface through the beat: vertex i is the same material point in every phase.
+
+    Raises
+    ------
+    InputError
+        When the vertices have not three axes, the first as long as there are phases.
+    """
 
     vertices_mm: Float
     """``(phase, n, 3)`` positions."""

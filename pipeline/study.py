@@ -172,8 +172,9 @@ def open_study(folder: Path) -> Study:
     Raises
     ------
     InputError
-        When there is no such folder, no cine in it, ``study.yaml`` is wrong, or a file that it
-        names does not exist.
+        When there is no such folder, no cine in it, ``study.yaml`` is wrong, a file that it names
+        does not exist, tracked ultrasound has no ECG, or there is what a user seems to have meant
+        for a part of the study and nothing would read.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such study; give the folder that holds cine/ or study.yaml")

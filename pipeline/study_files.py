@@ -28,7 +28,8 @@ def files_below(path: Path) -> list[Path]:
     Raises
     ------
     InputError
-        When a folder cannot be entered, or holds what is neither file nor folder.
+        When a folder cannot be entered, or holds what is neither file nor folder, or a link that
+        leads nowhere.
     """
     require_no_device(path)
     if not path.is_dir():
@@ -86,7 +87,13 @@ def cannot_be_entered(error: OSError) -> str:
 
 
 def record_files(stem: Path | None) -> list[Path]:
-    """All files of an ECG record: what begins with its name, and what a WFDB header names."""
+    """All files of an ECG record: what begins with its name, and what a WFDB header names.
+
+    Raises
+    ------
+    InputError
+        When the record's folder cannot be entered, or as in `names_in_header`.
+    """
     if stem is None:
         return []
     if stem.suffix in WFDB_ENDINGS:
@@ -104,7 +111,13 @@ def record_files(stem: Path | None) -> list[Path]:
 
 
 def is_of_record(path: Path, record: Path) -> bool:
-    """Whether a file that is there is one that an ECG record, as a user names it, is read from."""
+    """Whether a file that is there is one that an ECG record, as a user names it, is read from.
+
+    Raises
+    ------
+    InputError
+        As in `names_in_header`.
+    """
     stem = record.with_suffix("") if record.suffix in WFDB_ENDINGS else record
     header = stem.parent / f"{stem.name}.hea"
     read = [record, header, *(header.parent / name for name in names_in_header(header))]
@@ -146,6 +159,11 @@ def sweep_files(sweep: Path) -> list[Path]:
     """A MetaImage file, and what its header names as the files of its pixels.
 
     Of a pattern or a list of files it is all others in the folder that no header is in.
+
+    Raises
+    ------
+    InputError
+        When the file or its folder cannot be read, or the header names files in other folders.
     """
     try:
         with sweep.open("rb") as file:
@@ -171,11 +189,14 @@ def require_signals(header: Path) -> None:
     Raises
     ------
     InputError
-        Naming the first that is not there.
+        Naming the first that is not there; or as in `names_in_header`.
     """
-    for name in names_in_header(header):
-        segment = header.parent / f"{name}.hea"
-        if segment != header and segment.is_file():
-            require_signals(segment)
-        elif not (header.parent / name).is_file():
-            raise InputError(f"{header}: names {name}, which is not beside it; copy it there")
+    headers = [header]
+    # Segments may name one another in a ring.
+    for one in headers:
+        for name in names_in_header(one):
+            segment = one.parent / f"{name}.hea"
+            if segment != one and segment.is_file():
+                headers += [segment] if segment not in headers else []
+            elif not (one.parent / name).is_file():
+                raise InputError(f"{one}: names {name}, which is not beside it; copy it there")

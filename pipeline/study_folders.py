@@ -27,7 +27,8 @@ def found_cine(folder: Path, given: Any) -> Any:
     Raises
     ------
     InputError
-        When the folder holds several NIfTI files, one beside DICOM files, or a timing of none.
+        When the folder holds several NIfTI files, one beside DICOM files, a timing of none or one
+        by another name, or as in `files_below`.
     """
     path = given.get("path", "cine") if isinstance(given, dict) else None
     if not isinstance(path, str):

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float
+from pipeline.imaging.ecg import read_ecg
 from pipeline.study import EcgFiles, open_study
 from pipeline.study_files import files_below
 
@@ -330,6 +331,15 @@ def test_files_that_headers_name_are_input_too(tmp_path: Path) -> None:
     (ecg / "first.hea").unlink()
     with pytest.raises(InputError, match=r"us\.hea: names first, which is not beside it"):
         open_study(folder)
+
+
+def test_records_that_name_each_other_are_refused(tmp_path: Path) -> None:
+    folder = study_folder(tmp_path)
+    for name, other in (("us", "b"), ("b", "us")):
+        (folder / "ecg" / f"{name}.hea").write_text(f"{name}/1 1 500 2000\n{other} 2000\n")
+    assert {"us.hea", "b.hea"} < {path.name for path in open_study(folder).input_files()["us"]}
+    with pytest.raises(InputError, match=r"us\.hea"):
+        read_ecg(folder / "ecg" / "us")
 
 
 def test_a_record_may_have_brackets_in_its_name(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ class Room:
     Parameters
     ----------
     path
-        The ``field.zarr`` folder.
+        The ``field.zarr`` folder, of a field that knows its ``rr_s``.
     structure
         The surface that must not be touched.
     seed

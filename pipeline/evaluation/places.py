@@ -26,8 +26,8 @@ def settle(
 ) -> Float:
     """Move points along the gradient until the distance there is ``height_mm``.
 
-    Newton's steps ``(height - d) g / |g|^2``, of no more than 2 mm each; points near a medial
-    axis may not arrive.
+    Newton's steps ``(height - d) g / |g|^2``, of no more than 2 mm times ``|g|`` each; points near
+    a medial axis may not arrive.
 
     Parameters
     ----------

@@ -43,11 +43,12 @@ def at_the_handle(force, torque, handle, pivot, length):  # type: ignore[no-unty
 
 @inner
 def frame_of(tip, pivot, pose):  # type: ignore[no-untyped-def]
-    """Pose of a tool on the rod, into a 4x4: z from the tip up the shaft, x level with LPS y."""
+    """Pose of a tool on the rod, into a 4x4: z from the tip up the shaft, x square to LPS y, or to
+    LPS x where the rod lies along y."""
     zx, zy, zz = pivot[0] - tip[0], pivot[1] - tip[1], pivot[2] - tip[2]
     size = math.sqrt(zx * zx + zy * zy + zz * zz)
     zx, zy, zz = zx / size, zy / size, zz / size
-    # Away from the axis that the rod lies least along, so that the frame never degenerates.
+    # An axis that the rod does not lie along, so that the frame never degenerates.
     ax, ay, az = (0.0, 1.0, 0.0) if abs(zy) < 0.9 else (1.0, 0.0, 0.0)
     xx, xy, xz = ay * zz - az * zy, az * zx - ax * zz, ax * zy - ay * zx
     size = math.sqrt(xx * xx + xy * xy + xz * xz)

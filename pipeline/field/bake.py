@@ -39,7 +39,13 @@ from pipeline.progress import Progress
 
 @dataclass(frozen=True, slots=True)
 class SurfaceSeries:
-    """One surface through the beat, where triangles may differ from phase to phase."""
+    """One surface through the beat, where triangles may differ from phase to phase.
+
+    Raises
+    ------
+    InputError
+        When there are not as many surfaces as phases.
+    """
 
     surfaces: tuple[Surface, ...]
     """One a phase."""
@@ -104,8 +110,12 @@ def bake_field(
     Raises
     ------
     InputError
-        When a fixture's surface is missing, a surface is open or faces inwards, phases differ,
-        or the field would be larger than the settings allow.
+        When there is no fixture, a fixture's surface is missing, a name can be no folder, a surface
+        is open or faces inwards, or has vertices that are not finite or of no triangle, phases
+        differ, do not rise in [0, 1) or lie nearer than 0.001, ``mr_from_tracker`` is not rigid, or
+        the field would be larger than the settings allow.
+    pydantic.ValidationError
+        When ``rr_s`` is not above 0.
     StageError
         When the finished field is not as exact as ``settings.bounds`` demand.
     """

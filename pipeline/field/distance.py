@@ -77,6 +77,12 @@ def distance_of_closed(surface: Surface, grid: Grid, threads: int | None = None)
     Returns
     -------
     ``(z, y, x)`` array, mm.
+
+    Raises
+    ------
+    StageError
+        When a row of nodes enters and leaves the surface unequally often, as one that is not
+        closed.
     """
     from pipeline.field.nearest import TOP, block_distance, levels_of_blocks, prepared
     from pipeline.field.triangle_tree import plant

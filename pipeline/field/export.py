@@ -39,8 +39,9 @@ def export_field(path: Path, form: str, out: Path) -> Path:
     Raises
     ------
     InputError
-        When the format is unknown, the folder exists or cannot be written, or the field cannot
-        be read. Nothing is left behind then.
+        When the format is unknown, the folder exists, lies in the field or cannot be written, the
+        field cannot be read, or ``mhd`` cannot name its files: their path holds a % or the end of
+        a line. Nothing is left behind then.
     """
     if form not in WRITERS:
         raise InputError(f"--to {form}: no such format; there are {', '.join(WRITERS)}")

@@ -1,7 +1,7 @@
 """Virtual fixtures, the haptic devices that bound them, and the settings of the bake stage.
 
 The potential of a fixture is ``f(q) = 1 - exp(-(q^2 / (2 delta^2))^m)``; its force is at most
-``f_max_n``. Everything here is plain data: importing it costs milliseconds.
+``f_max_n``. Everything here is plain data: importing it brings pydantic, and no NumPy.
 """
 
 from __future__ import annotations

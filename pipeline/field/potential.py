@@ -29,7 +29,7 @@ def offence(distance_mm: Numbers, side: int) -> Numbers:
 
 
 def potential(q_mm: Numbers, delta_mm: float, m: int) -> Numbers:
-    """Potential ``f(q) = 1 - exp(-(q^2 / (2 delta^2))^m)``, in [0, 1).
+    """Potential ``f(q) = 1 - exp(-(q^2 / (2 delta^2))^m)``, from 0 on; rounded, it is 1 far off.
 
     >>> float(round(potential(3.0, delta_mm=6.7, m=2), 4))
     0.01

@@ -210,7 +210,13 @@ def _corners_mm(path: Path) -> Float:
 
 
 def spread_points(corners_mm: Float, count: int, where: str = "a tool's mesh") -> Float:
-    """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time."""
+    """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time.
+
+    Raises
+    ------
+    InputError
+        When the triangles have no area.
+    """
     area = np.linalg.norm(area_vectors(corners_mm), axis=1)
     if not area.sum() > 0:
         raise InputError(f"{where}: has no area; give triangles that have some")

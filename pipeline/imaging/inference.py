@@ -135,8 +135,9 @@ def label_probability(
 
     Each slice gives three planes where its neighbours are the stack's own; where slices lie
     closer than that, only its own. Images are shown turned in up to ``most_views`` ways
-    (`turns_deg`), whose probabilities are averaged: in as many as there is time for, and all of
-    them where labels come and go from phase to phase (`doubted_planes`).
+    (`turns_deg`), whose probabilities are averaged: in as many as there is time for, and in more,
+    all of them where few images are doubted, where labels come and go from phase to phase
+    (`doubted_planes`).
     """
     step = neighbour_steps(view.slice_step_mm)
     planes = PLANES if step == 1 else 1
@@ -183,7 +184,8 @@ def turns_deg(phase: int, count: int) -> tuple[float, ...]:
 def more_turns_deg(phase: int, count: int, most: int, images: int) -> tuple[float, ...]:
     """Turns in which the doubted among a phase's images are shown, too, after ``count`` others.
 
-    ``images`` are doubted in all; however many they are, they are shown about twice `LOOKS` times.
+    ``images`` are doubted in all; they are shown up to about twice `LOOKS` times more, and each at
+    least once.
     """
     others = [one for one in turns_deg(phase, most) if one not in turns_deg(phase, count)]
     return tuple(others[: max(1, round(2 * LOOKS / images))])

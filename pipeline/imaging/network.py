@@ -95,7 +95,8 @@ def predict(images: Float32) -> Float32:
 
 
 def normalise(image: Float32, known: Mask | None = None) -> Float32:
-    """Grey values of one image with the 1st percentile at 0 and the 99th at 1, cut off outside.
+    """Grey values of one image with the 1st percentile at 0 and the 99th at 1, cut off below -0.2
+    and above 1.6.
 
     Percentiles are those of the `WINDOW` pixels about the middle, as many as training images have,
     where ``known``. An image without contrast comes out as zeros.

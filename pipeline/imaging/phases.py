@@ -35,9 +35,9 @@ def common_phases(
     Raises
     ------
     InputError
-        When an RR interval is implausible, a trigger time lies outside its heartbeat, all lie
-        within a small part of it, or of n phases those of a slice are over half an n-th of a cycle
-        and over `ALIKE` away from the others'.
+        When an RR interval is implausible, a trigger time is no number or lies outside its
+        heartbeat, phases do not rise, all lie within a small part of the beat, or of n phases those
+        of a slice are over half an n-th of a cycle and over `ALIKE` away from the others'.
     """
     numbers = range(len(rr_ms)) if numbers is None else numbers
     _require_heartbeats(rr_ms, where)

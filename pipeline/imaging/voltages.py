@@ -22,7 +22,13 @@ def is_voltage(unit: str) -> bool:
 
 
 def millivolts(unit: str, lead: str, where: str) -> float:
-    """Millivolts in one ``unit``."""
+    """Millivolts in one ``unit``.
+
+    Raises
+    ------
+    InputError
+        When that is no unit of a voltage.
+    """
     if not is_voltage(unit):
         remedy = "take it out, for pressures and breathing have beats of their own"
         if unit_name(unit) in UNCALIBRATED:

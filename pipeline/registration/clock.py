@@ -75,7 +75,8 @@ class PhaseClock:
     Raises
     ------
     InputError
-        When a number is not positive, or the cycle is none of a heart.
+        When a number is not positive, the cycle is None or none of a heart, or the latency is over
+        1 s.
     """
 
     def __init__(
@@ -103,9 +104,10 @@ class PhaseClock:
     def beat(self, r_time_s: float, strange: bool = False) -> Kind | None:
         """Tell the clock of an R peak; what kind of beat it is.
 
-        None when it does not count, and nothing changes: it lies no later than one that was told
-        already, or more than 3 s after the latest time that the clock was told of, by :meth:`at` or
-        by a beat. So far ahead it was timed by another clock, or in another unit.
+        None when it does not count: it lies no later than one that was told already, or more than
+        3 s after the latest time that the clock was told of, by :meth:`at` or by a beat. So far
+        ahead it was timed by another clock, or in another unit. The phase goes on as if it had not
+        been told; it is the last beat to :meth:`take_back`, which then takes nothing back.
 
         Parameters
         ----------

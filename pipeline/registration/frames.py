@@ -274,7 +274,13 @@ def sample_pictures(
 
 
 def pixel_size_mm(sweep: TrackedSweep) -> Float:
-    """Width and height of a pixel."""
+    """``(2,)`` width and height of a pixel.
+
+    Raises
+    ------
+    InputError
+        When no pose is finite, or pixels are not of one size above 0 in all frames, to a hundredth.
+    """
     axes = sweep.tracker_from_image[:, :3, :2]
     usable = axes[np.isfinite(sweep.tracker_from_image).all(axis=(1, 2))]
     if len(usable) == 0:

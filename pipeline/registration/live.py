@@ -245,6 +245,8 @@ def prepare_follower(
     ------
     InputError
         As in `pipeline.registration.space.register`.
+    StageError
+        When the network cannot be loaded.
     """
     settings = settings or RegisterSettings()
     pose = registered.mr_from_tracker

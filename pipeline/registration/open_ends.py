@@ -124,7 +124,8 @@ class OpenLid:
 def open_lids(surfaces: Mapping[str, MovingSurface], ends: Sequence[OpenEnd] = ()) -> list[OpenLid]:
     """The ventricles whose atria have no surface, but for those that the stack's ``ends`` cut.
 
-    None where the left one's lid at the valve plane cannot be told: it gives the direction.
+    An empty list where the left one's lid at the valve plane cannot be told: it gives the
+    direction.
     """
     cut = {name for end in ends for name in end.chambers}
     if not {"lv_endocardium", "epicardium"} <= surfaces.keys():

@@ -38,7 +38,8 @@ class Pivot:
     """``(3,)`` what is turned about: the middle of the heart."""
 
     lever_mm: float
-    """Root mean square distance of the heart from it: a turn by angle a moves it by a levers."""
+    """Root mean square distance of the heart from it: a turn by angle a moves what lies so far from
+    its axis by a levers, and a heart as wide in every direction by the root of 2/3 of that."""
 
     def move(self, mr_from_tracker: Float, step_mm: Float) -> Float:
         """The pose shifted by ``step_mm[:3]`` and turned by the rotation vector

@@ -28,7 +28,7 @@ STILL_S, LOOK_EVERY_S = 0.10, 0.005
 STILL_SHARE, BACK_SHARE = 0.33, 0.66
 """A lead whose swing is under the first share of that in its stillest moments is lost, until it is
 over the second. The swing of ten samples of noise, the fewest in a window, comes under the smallest
-of eighty windows by such a factor less than once in a million windows."""
+of eighty windows by such a factor some four times in a million windows."""
 DEAD_SHARE = 0.05
 """A lost lead that swings by more than this share of its stillest moments may be one that is less
 noisy than before: what it shows becomes its stillest moment once it comes back."""

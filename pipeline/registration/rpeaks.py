@@ -53,7 +53,7 @@ deviations of the logarithm: complexes of 0.08 s, and of 0.12 s as the narrowest
 are 1.5 apart."""
 # Of a normal distribution, by its median absolute deviation.
 _DEVIATION = 1.4826
-# The wavelet's standard deviation: its band is 6 to 33 Hz at half height, 19 Hz in the middle.
+# The wavelet's standard deviation: its band is 7 to 23 Hz at half height, the summit at 15 Hz.
 _WAVELET_S = 0.016
 _HALF_S, _MEAN_S, _CONFIRM_S = 0.050, 0.025, 0.055
 # Near the width of a QRS complex, which times it best in noise; and one that keeps its summit.

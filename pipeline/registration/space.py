@@ -195,10 +195,11 @@ def register(
     Raises
     ------
     InputError
-        When the start is not rigid, frames are too few or never cross the heart near the start,
-        phases or transforms do not fit the frames, or no cavity is given.
+        When the start is not rigid, frames are too few, show no body or never cross the heart near
+        the start, phases or transforms do not fit the frames, no cavity is given, or cavities (and
+        the cine, where grey values are compared) have not the same phases.
     StageError
-        When the verdict is worse than the settings accept.
+        When the verdict is worse than the settings accept, or the network cannot be loaded.
     """
     settings = settings or RegisterSettings()
     found = find(sweeps, phases, surfaces, start, settings, progress, timing, cine)
@@ -229,6 +230,8 @@ def find(
     ------
     InputError
         As in `register`.
+    StageError
+        When the network cannot be loaded.
     """
     tell = progress or (lambda done, total: None)
     if start is not None:

@@ -79,7 +79,7 @@ MOST_TURN_S = 0.1
 FOLLOWED = 0.1
 """Share of the difference by which a turn changes what is a usual one."""
 MOST_TIME_S = 1e11
-"""A number beyond is no time in seconds: three thousand years, and too coarse for a phase."""
+"""A number beyond is no time in seconds: three thousand years."""
 
 
 @asked

@@ -92,6 +92,11 @@ def joined(
 
     Tunnels between them are plugged: open in one phase and closed in the next, they would fold any
     mesh that goes through the beat.
+
+    Raises
+    ------
+    StageError
+        When the bodies stay in pieces in some phase.
     """
     blend_mm = settings.heart_blend_mm
     spacing_mm = bodies[0].levels[0].spacing_mm
