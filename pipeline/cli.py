@@ -32,7 +32,7 @@ from pipeline.console import (
     warning_line,
 )
 from pipeline.ending import guarded, hear_signals
-from pipeline.errors import INTERRUPTED_CODE, BeatfieldError, InputError
+from pipeline.errors import INTERRUPTED_CODE, NOT_TO_BE_USED, BeatfieldError, InputError
 from pipeline.paper.options import PAPER, PaperOptions
 from pipeline.summary import summary
 
@@ -57,11 +57,17 @@ def _run(
     study: Path, out: Path, config: Path | None, first: str | None = None, last: str | None = None
 ) -> dict[str, Any]:
     from pipeline.config import read_settings
+    from pipeline.publish import standing_products
     from pipeline.run import run_study
     from pipeline.study import open_study
 
-    settings = read_settings(config)
-    return run_study(open_study(study), settings, out, Console(), first, last)
+    try:
+        settings, opened = read_settings(config), open_study(study)
+    except InputError as error:
+        for products in standing_products(study, out):
+            error.add_note(f"{products} holds products of another run; {NOT_TO_BE_USED}")
+        raise
+    return run_study(opened, settings, out, Console(), first, last)
 
 
 def _stage_name(name: str | None) -> str | None:

@@ -26,7 +26,7 @@ from pipeline.progress import Progress
 from pipeline.publish import only_run_in, publishing
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.mesh import adjacency
-from pipeline.surface_folders import OwnSurfaces, read_own_surfaces
+from pipeline.surface_folders import OwnSurfaces, odd_sizes, read_own_surfaces
 
 SAME_VOLUME, ELSEWHERE_MM = 1e-3, 0.01
 """Surfaces that differ from those baked by a larger share of volume, or lie farther off, are other
@@ -69,7 +69,7 @@ def bake_own_surfaces(
                     "beatfield": __version__,
                     "bake": settings.bake.model_dump(mode="json"),
                 },
-                doubts_of=few_phases,
+                doubts_of=lambda found: [*odd_sizes(own.surfaces), *few_phases(found)],
                 progress=progress,
             )
         except StageError as error:

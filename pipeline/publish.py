@@ -253,6 +253,18 @@ def read_record(products: Path | None) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def standing_products(study: Path, out: Path) -> list[Path]:
+    """The folders in ``out`` with products of a study, which may no longer be understood: its
+    ``run.json`` names the study's folder, or one in it."""
+    folder = study.resolve()
+    return [
+        products
+        for products in sorted(path.parent for path in out.glob("*/run.json"))
+        if isinstance(made_of := read_record(products).get("study"), str)
+        and folder in (Path(made_of), Path(made_of).parent)
+    ]
+
+
 def stale_words(field: Path) -> str:
     """That a field is not what the last run over its study was to make; empty where it is, or
     where nothing is said of it."""

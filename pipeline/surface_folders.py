@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,12 @@ from pipeline.validation import Section, describe_validation, each_key_once
 
 SMALLEST_MM, LARGEST_MM = 1.0, 2000.0
 """From end to end; a heart in metres or micrometres lies outside."""
+
+SMALL_MM = 15.0
+"""A heart in centimetres measures less from end to end."""
+
+UNLIKE = 3.0
+"""No part of a heart is so many times as long in one phase as in another."""
 
 NUMBERED = re.compile(r"(?P<structure>.+)_(?P<number>\d+)")
 
@@ -99,11 +105,35 @@ def read_own_surfaces(
     return OwnSurfaces(series, timing, digests)
 
 
+def odd_sizes(surfaces: Mapping[str, SurfaceSeries]) -> list[str]:
+    """Sentences on structures that may be in centimetres, in all phases or in some."""
+    told = []
+    for name, series in surfaces.items():
+        sizes_mm = np.array([_size_mm(one) for one in series.surfaces])
+        least, most = int(sizes_mm.argmin()), int(sizes_mm.argmax())
+        if sizes_mm[most] > UNLIKE * sizes_mm[least]:
+            told.append(
+                f"{name}: measures {sizes_mm[least]:.3g} mm from end to end in phase {least} and "
+                f"{sizes_mm[most]:.3g} mm in phase {most}: are all files in millimetres, and of "
+                "one structure?"
+            )
+        elif sizes_mm[most] < SMALL_MM:
+            told.append(
+                f"{name}: measures {sizes_mm[most]:.3g} mm from end to end: if that is a heart's "
+                "centimetres, give millimetres"
+            )
+    return told
+
+
+def _size_mm(surface: Surface) -> float:
+    return float(np.ptp(surface.vertices_mm, axis=0).max())
+
+
 def _closed(path: Path) -> Surface:
     surface = read_mesh(path)
     if not np.isfinite(surface.vertices_mm).all():
         raise InputError(f"{path}: has vertices that are no numbers; export the surface again")
-    size_mm = float(np.ptp(surface.vertices_mm, axis=0).max())
+    size_mm = _size_mm(surface)
     if not SMALLEST_MM <= size_mm <= LARGEST_MM:
         raise InputError(
             f"{path}: measures {size_mm:.3g} mm from end to end, surfaces between {SMALLEST_MM:g} "

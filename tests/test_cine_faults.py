@@ -332,10 +332,15 @@ def told_by_half(**fields: Any) -> Any:
     return change
 
 
-def test_slices_of_two_patients_are_no_stack(tmp_path: Path) -> None:
-    write_dicom(tmp_path, told_by_half(PatientID=("A17", "B4")))
-    with pytest.raises(InputError, match=r"\.dcm and .*\.dcm have different PatientIDs"):
+@pytest.mark.parametrize("told", ["PatientID", "PatientBirthDate"])
+def test_slices_of_two_patients_are_no_stack(tmp_path: Path, told: str) -> None:
+    values = {"PatientID": ("A17", "B4"), "PatientBirthDate": ("19500101", "19810230")}[told]
+    write_dicom(tmp_path, told_by_half(**{told: values}))
+    with pytest.raises(InputError, match=rf"\.dcm and .*\.dcm have different {told}s") as error:
         read_dicom_study(tmp_path)
+    assert not any(value in str(error.value) for value in values)
+    write_dicom(tmp_path / "other", told_by_half(**{told: (values[0], "")}))
+    read_dicom_study(tmp_path / "other")
 
 
 def test_a_stack_knows_its_patient(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import struct
@@ -245,6 +246,24 @@ def test_a_nifti_header_of_nonsense_is_told(
     path.write_bytes(header.binaryblock + content[len(header.binaryblock) :])
     with pytest.raises(InputError, match=words):
         read_nifti_cine(path, None, None)
+
+
+@pytest.mark.parametrize("damage", ["a voxel", "the checksum", "the end"])
+def test_a_packed_cine_that_is_not_what_its_checksum_says_is_refused(
+    tmp_path: Path, damage: str
+) -> None:
+    """Not packed at all inside, so that a bit is a voxel's, and nothing else tells of it."""
+    path = tmp_path / "cine.nii.gz"
+    voxels = np.random.default_rng(5).integers(0, 999, (64, 64, 4, 3)).astype(np.int16)
+    image = nibabel.Nifti1Image(voxels, np.diag([1.5, 1.5, 8, 1]))
+    whole = gzip.compress(image.to_bytes(), compresslevel=0)
+    path.write_bytes(whole)
+    assert read_nifti_cine(path, None, 800).cine.intensity.shape == (3, 4, 64, 64)
+    flipped = bytearray(whole)
+    flipped[{"a voxel": len(whole) // 2, "the checksum": -6, "the end": -1}[damage]] ^= 4
+    path.write_bytes(flipped if damage != "the end" else whole[:-8])
+    with pytest.raises(InputError, match="truncated or damaged"):
+        read_nifti_cine(path, None, 800)
 
 
 def test_an_ecg_that_promises_more_than_it_describes_is_refused_at_once(tmp_path: Path) -> None:

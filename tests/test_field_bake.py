@@ -28,6 +28,7 @@ from pipeline.own_surfaces import (
     measure_field,
     what_was_baked,
 )
+from pipeline.surface_folders import odd_sizes, read_own_surfaces
 
 BOX_FIXTURE = {"hold": Fixture(structure="box", kind="guidance", delta_mm=8.0, f_max_n=2.0)}
 
@@ -352,7 +353,7 @@ def folder(tmp_path):
     (folder / "ball").mkdir(parents=True)
     for number, ending in enumerate(("vtp", "stl", "ply")):
         save(folder / f"box_{number:03d}.{ending}", box((-19, -18, -17), (19 + number, 18, 17)))
-    save(folder / "ball" / "000.vtp", sphere(5, 2))
+    save(folder / "ball" / "000.vtp", sphere(8, 2))
     return folder
 
 
@@ -509,6 +510,30 @@ def test_timing_and_tracker_of_ones_own(folder, tmp_path):
         "phases    3, evenly spaced from 0; the length of the beat (rr_s) and a tracker "
         "(mr_from_tracker) not known: phases.json may tell"
     )
+
+
+@pytest.mark.parametrize(
+    ("scales", "said"),
+    [
+        ((1, 1), None),
+        # Nobody's heart, but it may be of something else.
+        ((0.1, 0.1), "box: measures 8 mm from end to end: if that is a heart's centimetres"),
+        ((1, 0.1), "box: measures 8 mm from end to end in phase 1 and 80 mm in phase 0"),
+    ],
+)
+def test_surfaces_that_may_be_in_centimetres_are_told(tmp_path, scales, said):
+    folder = tmp_path / "own"
+    folder.mkdir()
+    for number, scale in enumerate(scales):
+        corner = scale * np.array([40.0, 30.0, 20.0])
+        save(folder / f"box_{number:03d}.ply", box(-corner, corner))
+    doubts = odd_sizes(read_own_surfaces(folder).surfaces)
+    assert len(doubts) == (said is not None)
+    if said:
+        assert doubts[0].startswith(said)
+    if scales == (0.1, 0.1):
+        field = bake_own_surfaces(folder, tmp_path / "out", own_settings(fit_rounds=0))
+        assert f"doubtful  {doubts[0]}" in what_was_baked(field)
 
 
 def test_a_single_file_is_a_surface_at_rest(tmp_path):

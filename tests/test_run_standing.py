@@ -12,6 +12,7 @@ import pytest
 from kitchen import Kitchen
 
 from pipeline import run as runner
+from pipeline.cli import main
 from pipeline.config import Settings
 from pipeline.errors import InputError, StageError
 from pipeline.job import Job, Skipped
@@ -268,6 +269,24 @@ def test_files_that_vanish_while_the_study_runs_are_told(kitchen: Kitchen, left:
     with pytest.raises(InputError, match=r"(image|heart\.nii): changed while the study ran"):
         kitchen.run()
     assert not (kitchen.out / "p1" / "a").exists()
+
+
+def test_a_run_that_is_refused_at_once_tells_of_what_stands(
+    kitchen: Kitchen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kitchen.run()
+    (kitchen.folder / "study.yaml").write_text("patient_id: p1\ncine: {path: other.nii}\n")
+    assert main(["run", str(kitchen.folder), "--out", str(kitchen.out)]) == 2
+    said = capsys.readouterr().err
+    assert "other.nii does not exist" in said
+    assert f"note: {kitchen.out / 'p1'} holds products of another run; do not use them" in said
+    # Nobody knows of another folder's products, or of another study's.
+    assert main(["run", str(kitchen.folder), "--out", str(tmp_path / "none")]) == 2
+    other = tmp_path / "other"
+    (other / "cine").mkdir(parents=True)
+    (other / "study.yaml").write_text("nothing: known\n")
+    assert main(["run", str(other), "--out", str(kitchen.out)]) == 2
+    assert "note:" not in capsys.readouterr().err
 
 
 def test_a_field_of_an_earlier_run_is_told(kitchen: Kitchen, tmp_path: Path) -> None:

@@ -3,13 +3,15 @@ scanners, trackers and arms repeat is not."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sweep_files import calibration, text, write
 
 from pipeline.errors import InputError
 from pipeline.imaging.stuck import without_stuck
-from pipeline.imaging.ultrasound import Sweep, read_sweep, remarks_on
+from pipeline.imaging.ultrasound import Sweep, leaps, read_sweep, remarks_on
 
 COUNT, RATE_HZ = 60, 20.0
 STUCK = slice(20, 35)
@@ -189,3 +191,26 @@ def test_a_sweep_of_which_no_frame_is_left_is_refused(rng):
     images = repeating(recording(poses).images, slice(15, COUNT))
     with pytest.raises(InputError, match=r"^s: 60 of 60 frames left out: .*record the sweep"):
         without_stuck(recording(poses, images))
+
+
+def test_a_probe_that_is_suddenly_elsewhere_and_stays_there_is_told(rng):
+    """150 mm within 0.05 s are 3 m/s."""
+    poses = swept(rng)
+    assert leaps([recording(poses)]) == []
+    moved = poses.copy()
+    moved[20:, 1, 3] += 150
+    told = leaps([recording(poses), recording(moved)])
+    assert len(told) == 1
+    assert "s: the probe leaps by 150 mm within 50 ms after 3.95 s" in told[0]
+    # By less a hand may be, or what the tracker measures; what it measures wrongly comes back.
+    slower = poses.copy()
+    slower[20:, 1, 3] += 90
+    outliers = poses.copy()
+    outliers[[12, 30, 31, 45], 1, 3] += 400
+    assert leaps([recording(slower), recording(outliers)]) == []
+    # While the tracker did not see it, it may have been carried there.
+    times_s = recording(moved).times_s + np.where(np.arange(COUNT) < 20, 0, 1.0)
+    assert leaps([replace(recording(moved), times_s=times_s)]) == []
+    late = poses.copy()
+    late[-3:, 1, 3] += 150
+    assert leaps([recording(late)]) == []

@@ -117,12 +117,12 @@ def stack_frames(
         twice, there are fewer than 3 slices or 2 phases, or the timing is not that of one
         heartbeat.
     """
-    patients = _unlike(frames, "patient")
-    if patients:
-        raise InputError(
-            f"{where}: {patients} have different PatientIDs; a study is of one patient: take the "
-            "other's images out"
-        )
+    for name, keyword in (("patient", "PatientIDs"), ("born", "PatientBirthDates")):
+        if patients := _unlike(frames, name):
+            raise InputError(
+                f"{where}: {patients} have different {keyword}; a study is of one patient: take "
+                "the other's images out"
+            )
     chosen, left_out = choose_stack(frames, where)
     _require_timing(chosen)
     slices, time_name = _in_time(by_slice(chosen), where)

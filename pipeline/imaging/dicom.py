@@ -303,6 +303,7 @@ def _frame(
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
             frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
             patient=str(dataset.get("PatientID", "") or "").strip(),
+            born=str(dataset.get("PatientBirthDate", "") or "").strip(),
             number=_number(dataset, group, place),
             study=str(dataset.get("StudyInstanceUID", "") or ""),
             acquisition=_acquisition(dataset, group),

@@ -34,6 +34,9 @@ _FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
 # A sweep goes over centimetres, and no tracker sees a probe at its own place: what stays within
 # these is in metres.
 _STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
+# No hand moves a probe as fast; time stamps jitter, so a short way is no leap however short the
+# time; and so many steps on either side are a hand's again.
+_FASTEST_MM_S, _LEAP_MM, _STAYS = 2000.0, 20.0, 5
 # Logarithm of width over height of a pixel that is told of: calibrations are off by some per cent,
 # pixels of television are 7 % wider or 9 % narrower than high.
 _UNSQUARE = 0.03
@@ -268,6 +271,29 @@ def odd_transforms(sweeps: Sequence[Sweep]) -> str:
             "ImageToProbe is the identity, pixels for millimetres: give the probe's calibration"
         )
     return "; ".join(found)
+
+
+def leaps(sweeps: Sequence[Sweep]) -> list[str]:
+    """A sentence for each sweep whose probe is suddenly elsewhere, and stays there.
+
+    No hand is as fast; a single pose that is wrong comes back, and is none. Between them the
+    tracker or its reference was moved, and frames of one side may not meet the heart at all.
+    """
+    told = []
+    for sweep in sweeps:
+        steps_s = np.diff(sweep.times_s)
+        ways_mm = np.linalg.norm(np.diff(sweep.tracker_from_probe[:, :3, 3], axis=0), axis=1)
+        fast = np.flatnonzero(ways_mm > np.maximum(_FASTEST_MM_S * steps_s, _LEAP_MM))
+        apart = np.diff(fast, prepend=-1, append=len(steps_s))
+        alone = fast[(apart[:-1] > _STAYS) & (apart[1:] > _STAYS)]
+        if len(alone):
+            k = int(alone[ways_mm[alone].argmax()])
+            told.append(
+                f"{sweep.name}: the probe leaps by {ways_mm[k]:.0f} mm within "
+                f"{1000 * steps_s[k]:.0f} ms after {sweep.times_s[k]:.2f} s and stays there: was "
+                "the tracker or its reference moved? Cut the sweep there"
+            )
+    return told
 
 
 def _is_uncalibrated(sweep: Sweep) -> bool:

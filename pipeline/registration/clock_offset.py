@@ -312,6 +312,9 @@ class _Profile:
         offsets_s = beat_s / count * (np.arange(count) - count // 2)
         scores = np.array([self.at(float(one)).score(pose) for one in offsets_s])
         top = int(scores.argmax())
+        # Frames beside the heart fit at no time, and at all of them alike.
+        if not scores[top] > 0:
+            return 0.0, 1.0
         # A beat on all is as it was: the ends, half a beat to either side, are neighbours.
         peak = (scores >= np.roll(scores, 1)) & (scores >= np.roll(scores, -1))
         apart_s = np.abs(offsets_s - offsets_s[top])

@@ -441,22 +441,28 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
     sweep, shows = level.samples.sweep(sizes), _shows_heart(level, found.pose)
+    aside, clocks = outvoted(sweep, shows, settings.min_frames), found.clocks
+    # Frames beside the heart have no time of their own.
+    if clocks is not None and {clocks.ahead, clocks.behind} & {*aside}:
+        clocks = None
     evidence = Evidence(
         confidence=found.confidence,
         rival=found.rival,
         expected_mm=expected_mm,
         valid=int(found.bears_out.sum()),
-        # A frame that shows no body, or not the heart, speaks neither for a result nor against it.
+        # A frame that shows no body, or not the heart, speaks neither for a result nor against it;
+        # a sweep that shows bodies and not the heart is no sweep of this heart.
         frames=int(shows.sum()),
         shift_mm=shift_mm,
         turn_deg=turn_deg,
         outvoted=outvoted(sweep[shows], found.bears_out[shows], settings.min_frames),
+        aside=aside,
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
         elsewhere_mm=found.dissent.away_mm,
         apart=found.apart.gain,
         inspired=is_mostly_inspired(found.breath_mm),
-        clocks=found.clocks,
+        clocks=clocks,
         misplaced=found.misplaced,
     )
     return judge(evidence, settings)

@@ -64,6 +64,10 @@ class Evidence:
     outvoted: tuple[int, ...] = ()
     """Sweeps, counted from 1, few frames of which bear out what another sweep does."""
 
+    aside: tuple[int, ...] = ()
+    """Sweeps, counted from 1, few frames of which show the heart where it lies by the pose, of all
+    that show bodies, while most of another sweep's do."""
+
     size: Size = AS_IT_IS
     """Of the heart that the frames fit best."""
 
@@ -104,7 +108,11 @@ def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
     is good where its expected error is small, most frames bear it out and none of that is near.
     """
     failures, of_size = _failures(evidence, settings), _doubts_of_size(evidence.size)
-    of_parts = [*_doubts_of_dissent(evidence), *_doubts_of_parts(evidence.apart)]
+    of_parts = [
+        *_doubts_of_dissent(evidence),
+        *_doubts_of_place(evidence.aside),
+        *_doubts_of_parts(evidence.apart),
+    ]
     if failures and evidence.confidence < 1:
         # Where frames fit better in the wrong place, a size that fits better there says nothing.
         return Verdict("failed", "; ".join(failures))
@@ -222,6 +230,16 @@ def _doubts_of_dissent(evidence: Evidence) -> list[str]:
             "or the depth changed? Cut them off, or record the sweep again"
         ]
     return []
+
+
+def _doubts_of_place(aside: tuple[int, ...]) -> list[str]:
+    if not aside:
+        return []
+    return [
+        f"few frames of sweep {', '.join(map(str, aside))} show the heart where another sweep "
+        "places it: look at the unit of its poses (mm), its calibration and whether the patient or "
+        "the tracker was moved between them; leave it out if it is of something else"
+    ]
 
 
 def _doubts_of_parts(apart: float) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.errors import InputError, StageError, UnregistrableError
 from pipeline.geometry import Float, MovingSurface
 from pipeline.imaging.ecg import Ecg, other_patient, read_ecg
-from pipeline.imaging.ultrasound import Sweep, odd_transforms, read_sweeps, remarks_on
+from pipeline.imaging.ultrasound import Sweep, leaps, odd_transforms, read_sweeps, remarks_on
 from pipeline.job import Job, Skipped
 from pipeline.products import (
     FrameRow,
@@ -102,7 +102,7 @@ def _registered(
     """The registration; where there is none and the user wants it so, the MR's frame."""
     settings, phases = job.settings.register_, timing.phases()
     cine = read_cine(job.products / "ingest")
-    doubts = [*_doubts_of_images(job), *timing.doubts()]
+    doubts = [*_doubts_of_images(job), *leaps(sweeps), *timing.doubts()]
     known = start, settings, job.progress, timing, cine, doubts
     try:
         return register(sweeps, phases, surfaces, *known)
