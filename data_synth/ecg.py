@@ -106,7 +106,9 @@ def simulate_ecg(
     Raises
     ------
     SynthError
-        When the recording is too short for three beats, or the rates are not physiological.
+        When the recording is too short for three beats or longer than a day, ``mean_rr_s`` lies
+        outside 0.3 to 2.5 s or the sampling rate outside 100 to 2000 Hz, a lost lead ends after
+        the recording, or fibrillation starts no earlier than its end.
     """
     settings = settings or EcgSettings()
     _require_sensible(duration_s, mean_rr_s, sampling_rate_hz, settings)

@@ -114,7 +114,8 @@ def gradients(
 
     A cine plays the same lines again for each picture of a beat: their phase-encoding steps form a
     saw-tooth of that period, another part of it in each beat. The single pulses, some 300 a
-    second, and all harmonics above 0.45 of the sampling rate stop at the recorder's input filter.
+    second, and harmonics above the twelfth or above 0.45 of the sampling rate are left out, as by
+    the recorder's input filter; the first is there at any rate.
     """
     beat = np.searchsorted(r_times_s, times_s, side="right")
     part = rng.uniform(-1.0, 1.0, len(r_times_s) + 1)[beat]

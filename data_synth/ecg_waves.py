@@ -98,7 +98,7 @@ _ECTOPIC_T_MV: Mapping[Focus, tuple[float, float, float]] = {
 # field runs from feet to head. Their cross product points to the left and forward. It is seen
 # from above the heart, so some of it looks upright in the leads of the feet (a chosen share).
 _FLOW_VECTOR = (0.75, 0.40, -0.50)
-# Offset from R (s), width (s) and share of waves whose sum peaks at 1, 0.17 s after R; in diastole
+# Offset from R (s), width (s) and share of waves whose sum peaks at 1, 0.16 s after R; in diastole
 # a weak wave is reflected.
 _FLOW = ((0.15, 0.045, 0.86), (0.25, 0.060, 0.52), (0.42, 0.060, -0.22))
 # Radians by which the heart turns for each unit of modulation.

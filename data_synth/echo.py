@@ -139,7 +139,7 @@ class Optics:
 
     @property
     def pulse_mm(self) -> float:
-        """Standard deviation of the echo's envelope in range: four periods at half height.
+        """Standard deviation of the echo's envelope in range: 4.2 periods at half height.
 
         A period is half a wavelength of range, for sound goes there and back.
         """

@@ -7,10 +7,11 @@ Defining measures:
   Reson. 18:82, 2016) and 29 +- 12 % (Shams and Sultan, J. Clin. Imaging Sci. 11:40, 2021).
 - hypertrophic cardiomyopathy: a wall of 15 mm or more that load does not explain, here the septum
   (definition of Elliott et al., Eur. Heart J. 35:2733-2779, 2014).
-- dilated right ventricle: end-diastolic volume of at least 110 ml/m2 in men, 100 ml/m2 in women
-  with an ejection fraction of at most 45 % (task force criteria of 2010; te Riele et al.,
-  J. Cardiovasc. Magn. Reson. 16:50, 2014). The volume is drawn so; the fraction follows from the
-  stroke, and is more than 45 % in one in ten.
+- dilated right ventricle: end-diastolic volume of at least 110 ml/m2 in men, 100 ml/m2 in women,
+  the task force's major criterion of 2010, with an ejection fraction of at most 45 %, the end of
+  its minor one (te Riele et al., J. Cardiovasc. Magn. Reson. 16:50, 2014); the task force asks for
+  either, beside a wall that moves wrongly. The volume is drawn so; the fraction follows from the
+  stroke, and is more than 45 % in one in eight.
 - infarct: a segment in the territory of one coronary artery that does not contract, its wall
   scarred and thinned to less than 5.5 mm, which speaks against viability (Lopez-Lereu et al.,
   Rev. Esp. Cardiol. 57:826-833, 2004).

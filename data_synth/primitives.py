@@ -1,8 +1,8 @@
 """Building blocks of implicit bodies: distances to simple shapes, and how they are joined.
 
-Every function gives millimetres, negative inside. ``tube`` and ``rim`` of round shapes are exact;
-``ellipsoid`` and ``bullet`` are right to first order: value over slope of a smooth level function,
-so the error is of second order in the distance to the surface.
+Bodies are given in millimetres, negative inside. Outside of it, ``tube`` is exact where its radius
+does not change; ``ellipsoid``, ``bullet`` and ``rim`` are right to first order: value over slope of
+a smooth level function, so the error is of second order in the distance to the surface.
 """
 
 from __future__ import annotations

@@ -57,7 +57,8 @@ class MrSettings(BaseModel):
     slice_edge: float = Field(default=0.15, ge=0, le=0.5)
     """Standard deviation of the slice profile's blurred edges, as a share of the thickness."""
     through_plane_samples: int = Field(default=6, ge=1, le=32)
-    """Points of a voxel that are averaged, each at its own depth, place and instant."""
+    """Points of a voxel that are averaged, each at its own depth and place; no fewer than
+    ``window_samples``."""
     window_samples: int = Field(default=3, ge=1, le=9)
     """Instants over the acquisition window of a frame (one phase step wide, at most 1/25 of the
     beat) that the points of a voxel are spread over; 1 gives still frames."""

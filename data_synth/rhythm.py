@@ -34,7 +34,8 @@ _MAYER_HZ = 0.1
 _GRID_HZ = 8.0
 _LEAST_S = 256.0
 # Share of the sinus interval after which an early beat comes, and a second one after it. Their sum
-# leaves the next sinus beat more than the shortest interval at any rate allowed.
+# leaves the next sinus beat the shortest interval or more up to 160 beats a minute; above, that
+# beat comes later, and the pause is longer than it compensates for.
 _VENTRICULAR_COUPLING = 0.65
 _COUPLET_COUPLING = 0.5
 _ATRIAL_COUPLING = 0.7

@@ -43,7 +43,7 @@ class Samples(NamedTuple):
     offsets_mm: Float
     """``(sample, 3)`` LPS, from the voxel's middle."""
     instants: Float
-    """``(sample,)`` after the frame's own instant, in frame steps."""
+    """``(sample,)`` after the frame's own instant, as shares of the acquisition window."""
     shifts_mm: Float
     """``(sample, 3)`` LPS, of the heart off its mean place, as breathing brings it there."""
 
@@ -53,10 +53,12 @@ def spread_samples(
 ) -> Samples:
     """Points that stand for a voxel and its acquisition window, all with the same weight.
 
-    A Latin hypercube: depth, both places in the pixel and the instant each take every one of
-    their levels once, in orders given by low-discrepancy sequences (the plastic number's, Roberts
-    2018, and the golden ratio's). Depths are quantiles of the slice profile, a box of the given
-    thickness whose edges are blurred by a normal distribution of ``edge`` thicknesses.
+    A Latin hypercube: depth and both places in the pixel each take every one of their levels once,
+    and the instant each of the ``window_samples`` equally often, or as nearly as it can, in orders
+    given by low-discrepancy sequences (the plastic number's, Roberts 2018, and the golden
+    ratio's). Depths are quantiles of the slice profile, a box of the given thickness whose edges
+    are blurred by a normal distribution of ``edge`` thicknesses. There are as many points as the
+    larger of ``through_plane_samples`` and ``window_samples`` says.
     """
     count = max(settings.through_plane_samples, settings.window_samples)
     k = np.arange(1, count + 1)

@@ -82,8 +82,10 @@ def settings_of(study: Path) -> PhantomSettings:
     path = study / "truth" / "truth.json"
     try:
         content = json.loads(path.read_text())["settings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SynthError(f"{path}: holds no phantom's settings ({error!r})") from error
+    if not isinstance(content, dict):
+        raise SynthError(f"{path}: holds no phantom's settings (settings: {content!r})")
     return check_settings(content, str(path))
 
 
@@ -100,6 +102,12 @@ def simulate_study(
         Told (parts done, 100).
     done
         What ``progress`` is told at the end.
+
+    Raises
+    ------
+    SynthError
+        When the settings ask for what cannot be recorded, such as a lead that comes off after the
+        ECG's end, or sweeps longer than the ECG; see `simulate_ecg` and `simulate_sweeps`.
     """
     heart = load_heart(settings)
     middle = done * 55 // 100

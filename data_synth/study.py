@@ -49,7 +49,8 @@ def write_study(
     Raises
     ------
     SynthError
-        When the folder exists or cannot be written.
+        When the folder exists, with ``overwrite`` is no study, or cannot be written, or what is
+        asked for cannot be recorded: see `simulate_study`; of DICOM, `write_dicom`.
     """
     require_free(folder, overwrite)
     _require_text(folder.absolute())

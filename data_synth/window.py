@@ -49,7 +49,7 @@ class Anatomy(Protocol):
 
     @property
     def centre_mm(self) -> Float:
-        """``(3,)`` middle of the heart, LPS."""
+        """``(3,)`` centre of the mitral plane at the R peak, LPS."""
 
     @property
     def long_axis(self) -> Float:

@@ -44,10 +44,11 @@ def bake_own_surfaces(
     Raises
     ------
     InputError
-        When a file cannot be used, a fixture's surface is missing, or ``out`` not written.
+        When a file cannot be used, a fixture's surface is missing, or ``out`` not written; or the
+        field is out of its bounds and a surface passes through itself, or a shell of it faces the
+        wrong way, with the place.
     StageError
-        When the field is out of its bounds, with the place where a surface crosses itself if one
-        does.
+        When the field is out of its bounds and no surface is to blame.
     """
     own = read_own_surfaces(folder)
     field = out / "field.zarr"

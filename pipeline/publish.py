@@ -186,10 +186,11 @@ def only_run_in(folder: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        As `locked` does.
+        As `locked` does, or when what a killed run left cannot be cleared away.
     """
     with locked(folder):
-        remove_partials(folder)
+        with readable_write_errors(folder):
+            remove_partials(folder)
         yield
 
 

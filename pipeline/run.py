@@ -97,7 +97,11 @@ class Watcher(Protocol):
         """The stage in flight has done this much."""
 
     def ended(self, stage: str, outcome: str, seconds: float) -> None:
-        """A stage ended: done, unchanged, skipped or failed."""
+        """A stage ended: ``done``, ``unchanged``, ``failed``, or ``skipped: `` and why.
+
+        One that is unchanged, skipped as in an earlier run, or refused because its product was
+        altered has not been told to begin.
+        """
 
 
 @dataclass(slots=True)
@@ -134,6 +138,9 @@ def run_study(
     ------
     InputError, StageError
         As the stage that failed says; ``run.json`` records it, and finished stages stay.
+    InputError
+        When ``out`` lies inside the study, another run is at work in the products, they are of
+        another study with the same patient id, or an input cannot be read.
     """
     products = out / study.patient_id
     if products.resolve().is_relative_to(study.folder):

@@ -76,7 +76,8 @@ def _own_digest(content: Mapping[str, Any]) -> str:
 
 
 def sealed(folder: Path) -> dict[str, Any] | None:
-    """What ``stage.json`` says, or None where it or a file of the product is missing."""
+    """What ``stage.json`` says, or None where it is missing or cannot be read as such, or a file of
+    the product is missing."""
     try:
         content: dict[str, Any] = json.loads((folder / STAGE_FILE).read_text())
         whole = all((folder / name).is_file() for name in content["files"])
@@ -166,7 +167,8 @@ def _digest_said(entry: Any) -> object:
 
 def digest_of_files(files: Mapping[str, str]) -> str:
     """SHA-256 of what ``sha256sum`` prints of files, sorted by name in the order of bytes; of a
-    single one its own.
+    single one its own. Names with a backslash or a line's end stand as they are, which
+    ``sha256sum`` would escape.
 
     Parameters
     ----------

@@ -301,6 +301,14 @@ def test_a_folder_that_is_no_study_is_never_overwritten(tmp_path):
         settings_of(tmp_path / "precious")
 
 
+@pytest.mark.parametrize("told", ["null", "3", "[1]", '"a"', "[" * 100_000])
+def test_a_truth_without_settings_is_refused_in_words(tmp_path, told):
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "truth.json").write_text('{"settings": ' + told + "}")
+    with pytest.raises(SynthError, match=r"truth\.json: holds no phantom's settings"):
+        settings_of(tmp_path)
+
+
 @pytest.mark.slow
 def test_each_patient_can_be_made_alone(tmp_path):
     config = tmp_path / "small.yaml"

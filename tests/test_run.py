@@ -604,6 +604,19 @@ def test_killed_behind_the_renames_of_a_swap_leaves_the_new_product(tmp_path: Pa
         assert not list(tmp_path.glob(f".*{PARTIAL}*"))
 
 
+def test_what_a_killed_run_left_and_nobody_may_clear_away_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f".stage{PARTIAL}0").mkdir()
+
+    def refused(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr("pipeline.publish.remove", refused)
+    with pytest.raises(InputError, match="cannot be written"), only_run_in(tmp_path):
+        pytest.fail("nothing runs here")
+
+
 def test_who_reads_a_record_while_it_is_written_reads_a_whole_one(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     write_json(path, {"status": "running"})

@@ -31,7 +31,8 @@ MOVIE_PIXELS = 340
 
 
 def stack_grid(cine: SyntheticCine, number: int) -> Figure:
-    """Every slice of the stack at one phase number, apex first, with truth contours."""
+    """Slices of the stack at one phase number, apex first, with truth contours: all, or 18 evenly
+    chosen of more."""
     count = cine.intensity.shape[1]
     # An isotropic volume has far more slices than a page has room for.
     shown = np.unique(np.linspace(0, count - 1, min(count, 3 * COLUMNS)).round().astype(int))

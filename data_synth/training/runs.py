@@ -80,7 +80,13 @@ def has_ended(out: Path, settings: TrainSettings) -> bool:
 
 def left_of(out: Path, settings: TrainSettings) -> dict[str, Any] | None:
     """The state that a run of these settings had when it was kept last; None of one that has not
-    begun, or has ended."""
+    begun, or has ended.
+
+    Raises
+    ------
+    SynthError
+        When what is there is of a run of other settings.
+    """
     kept = out.with_suffix(".run")
     if not kept.is_file():
         return None
