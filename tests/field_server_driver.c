@@ -47,6 +47,7 @@ static int tank_of_nonsense(void)
     const double wrong[][2] = {{50, 20}, {-5, 20}, {NAN, 20}, {5, NAN}, {5, -1}};
     const double held[] = {20, 0, 0, 0, 0};
     double here[3] = {0, 0, 0}, there[3] = {1, 0, 0}, push[3] = {2, 0, 0}, bad[3] = {NAN, 0, 0};
+    double beyond[3] = {0, 0, 0};
     bf_tank tank;
     int n, fine = 1;
     for (n = 0; n < 5; n++) {
@@ -61,7 +62,29 @@ static int tank_of_nonsense(void)
     fine &= bad[0] == 0 && tank.level_mj == 1;
     push[0] = 2;
     bf_pass(&tank, there, push);
-    return fine && push[0] == 1 && tank.level_mj == 1;
+    fine &= push[0] == 1 && tank.level_mj == 1;
+    /* A number that is one, but so large that squares of it are none, is no place either. */
+    beyond[1] = -1e308;
+    push[0] = 2;
+    bf_pass(&tank, beyond, push);
+    fine &= push[0] == 0 && push[1] == 0;
+    bad[0] = 1e308;
+    bf_pass(&tank, there, bad);
+    return fine && bad[0] == 0 && tank.level_mj == 1;
+}
+
+/* What a field that is not open says: nothing is in it, and nothing was locked. */
+static int closed(const char *no_field)
+{
+    double origin[3] = {0, 0, 0}, force[3] = {9, 9, 9};
+    double pose[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    bf_tool point = {NULL, 1, 0, {0, 0, 0}};
+    bf_field field;
+    int fine = bf_open(&field, no_field) != BF_OK;
+    point.points_mm = origin;
+    fine &= !bf_contains(&field, origin) && bf_outside_share(&field, &point, pose) == 1;
+    fine &= bf_force(&field, 0, origin, 0, force) == BF_NO_SUCH_NAME && force[0] == 0;
+    return fine && bf_lock(&field) == BF_NOT_A_FIELD && !field.copied;
 }
 
 int main(int count, char **words)
@@ -78,6 +101,7 @@ int main(int count, char **words)
     else if (!strcmp(command, "gradients")) printf("%d\n", without_gradients(&field));
     else if (!strcmp(command, "lock")) printf("%d\n", locked(&field, bf_lock(&field)));
     else if (!strcmp(command, "tank")) printf("%d\n", tank_of_nonsense());
+    else if (!strcmp(command, "closed")) printf("%d\n", closed("no such folder"));
     else if (!strcmp(command, "tracker")) {
         bf_transform(field.mr_from_tracker, point, out);
         status = bf_force(&field, 0, out, 0.3, point);

@@ -186,3 +186,9 @@ def test_phases_map_alike(tmp_path):
     done = subprocess.run([target], input=questions.tobytes(), capture_output=True, check=True)
     expected = to_cycle(questions[:, 0], questions[:, 1], 0.85)
     np.testing.assert_allclose(np.frombuffer(done.stdout), expected, rtol=0, atol=1e-12)
+    # What tells no phase is no number, which a field refuses; a 0 would be the R peak's.
+    none = [[0.3, 0.8, 0], [0.3, 0, 0.8], [0.3, 0, 0], [0.3, -1, 0.8]]
+    none += [[0.3, np.nan, 0.8], [0.3, np.inf, 0.8], [0.3, 0.8, np.inf], [np.nan, 0.7, 0.8]]
+    given = np.array(none, dtype=float).tobytes()
+    done = subprocess.run([target], input=given, capture_output=True, check=True)
+    assert np.isnan(np.frombuffer(done.stdout)).all()

@@ -343,6 +343,17 @@ def test_verify_finds_a_flipped_bit(path, watched, tmp_path):
     assert b"not what the manifest says" in done.stdout
 
 
+def test_verify_finds_a_file_that_the_manifest_names_no_more(path, watched, tmp_path):
+    def forget(folder):
+        file = folder / "manifest.json"
+        content = json.loads(file.read_text())
+        del content["files"]["spline/ball/c/1/0/0/0"]
+        file.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+
+    done = run(watched, damaged(path, tmp_path / "f.zarr", forget), "verify")
+    assert b"not what the manifest says" in done.stdout
+
+
 def test_any_description_is_survived(path, watched, tmp_path):
     """Descriptions with bytes changed, cut or doubled at random, sealed anew so that they are
     parsed: refused or understood, never a fault that a sanitizer sees."""

@@ -304,6 +304,9 @@ def test_phases_beside_the_seam_are_places_in_the_cycle(field, tiny):
         (lambda f: f.force_at(1, 2, 3, 0, ""), "no fixture ''"),
         (lambda f: f.distance_at(1, 2, 3, 0, ""), "no structure ''"),
         (lambda f: f.force_n([[1, 2, 3]], 0, "gide"), "no fixture 'gide'; there are guide, stay"),
+        (lambda f: f.force_n([[1, 2, 3]], 0, ["guide"]), "no fixture"),
+        (lambda f: f.distance_mm([[1, 2, 3]], 0, ["ball"]), "no structure"),
+        (lambda f: f.force_n([[10**400, 2, 3]], 0), "points must be numbers"),
         (lambda f: f.distance_mm([[1, 2, 3]], 0, "bal"), "no structure 'bal'; there are ball, c"),
     ],
 )

@@ -74,6 +74,22 @@ def test_a_tank_of_nonsense_holds_nothing_and_no_number_passes_it(path, program)
     assert tank.passed((1, 0, 0), (2, 0, 0)) == (1, 0, 0)
 
 
+def test_after_a_place_too_large_for_its_square_a_tank_gives_what_it_held():
+    tank, x_mm, given_mj, force_n = EnergyTank(5.0, 20.0), 0.0, 0.0, (0.0, 0.0, 0.0)
+    tank.passed((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
+    assert tank.passed((-1e308, 0.0, 0.0), (3.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
+    assert tank.passed((0.0, 0.0, 0.0), (0.0, 1e308, 0.0)) == (0.0, 0.0, 0.0)
+    for _ in range(1000):
+        x_mm += 0.1
+        given_mj += 0.1 * force_n[0]
+        force_n = tank.passed((x_mm, 0.0, 0.0), (3.0, 0.0, 0.0))
+    assert 4.0 < given_mj <= 5.0
+
+
+def test_a_field_that_is_not_open_contains_nothing_and_is_not_locked(path, program):
+    assert run(program, path, "closed").stdout == b"1\n"
+
+
 def test_a_tracker_that_comes_and_goes_drains_no_more_than_the_tank_held():
     """Every second place is unknown, and the force pushes the hand on all the while."""
     tank, given_mj = EnergyTank(1.0, 20.0), 0.0
@@ -152,6 +168,7 @@ def test_a_tool_too_long_for_the_grid_is_refused_at_once(path, program):
         {"periodic": False},
         {"rr_s": -3.0},
         {"rr_s": 0.0},
+        {"rr_s": 10**400},
         {"fixtures__guide__m": 100},
         {"fixtures__guide__device_limits__force_n": 0.0},
         {"mr_from_tracker": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1 + 2e-6]]},

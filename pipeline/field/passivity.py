@@ -27,6 +27,10 @@ WITHHOLD, GIVE_BACK = 0.05, 0.005
 At 1 kHz all of it goes within 0.02 s and comes back within 0.2 s: 2 N at 100 N/s and at 10 N/s.
 """
 
+NONE = 1e100
+"""Millimetres or newtons beyond which no tool is and no device pushes: squares of larger ones may
+be infinite."""
+
 
 class EnergyTank:
     """What may be rendered of a force, tick by tick.
@@ -63,7 +67,7 @@ class EnergyTank:
     def passed(self, point_mm: Sequence[float], force_n: Sequence[float]) -> Triple:
         """The force to render at the tool's present point, of the one that is wanted.
 
-        Where one of them is not finite nothing is rendered.
+        Where a number of one of them is not finite, or beyond 1e100, nothing is rendered.
 
         Raises
         ------
@@ -74,10 +78,10 @@ class EnergyTank:
             raise InputError(
                 f"energy tank: point {point_mm} and force {force_n} must be three numbers each"
             )
-        if not math.isfinite(sum(point_mm)):
+        if not all(abs(number) <= NONE for number in point_mm):
             self._blind = True
             return 0.0, 0.0, 0.0
-        if not math.isfinite(sum(force_n)):
+        if not all(abs(number) <= NONE for number in force_n):
             force_n = (0.0, 0.0, 0.0)
         last = self._point_mm if self._point_mm is not None else point_mm
         way = [now - before for now, before in zip(point_mm, last, strict=True)]

@@ -91,7 +91,7 @@ def as_numbers(values: npt.ArrayLike, name: str) -> Float:
         if (given := np.asarray(values).dtype).kind not in "biufO":
             raise InputError(f"{name} must be numbers, got {given}")
         return np.ascontiguousarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} must be numbers ({error})") from None
 
 

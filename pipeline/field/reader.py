@@ -439,14 +439,15 @@ class ForceField:
     def _fixture(self, name: str | None) -> Fixture:
         if name is None:
             return self._fixtures[self._first]
-        if name not in self._fixtures:
+        if not isinstance(name, str) or name not in self._fixtures:
             raise self._unknown("fixture", name, self._fixtures)
         return self._fixtures[name]
 
     def _structure(self, name: str | None) -> str:
         if name is None:
             return self._fixture(None).structure
-        if name not in self._distances:
+        # What is no name may be nothing that can be looked up, either.
+        if not isinstance(name, str) or name not in self._distances:
             raise self._unknown("structure", name, self._distances)
         return name
 

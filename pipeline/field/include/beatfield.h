@@ -62,7 +62,7 @@ typedef enum {
     BF_NO_SUCH_NAME, /* number of a structure or fixture that is not there */
     BF_NOT_FINITE,   /* a coordinate or phase is not a number, infinite, or too large to add up */
     BF_NOT_RIGID,    /* mr_from_tool is no rotation and shift */
-    BF_WRONG_BOUND,  /* bound_n is not above 0 */
+    BF_WRONG_BOUND,  /* bound_n is not above 0, or not finite */
     BF_REPLACED      /* the store was replaced while it was opened: open it again */
 } bf_status;
 
@@ -108,13 +108,14 @@ const char *bf_text(bf_status status);
  * field is as bf_close leaves it. */
 bf_status bf_open(bf_field *field, const char *path);
 
-/* Compare every file of a field.zarr with its manifest (reads all of it; not for the loop). */
+/* Compare every file of a field.zarr with its manifest, and that with its own digest (reads all of it;
+ * not for the loop). */
 bf_status bf_verify(const char *path);
 
 /* Copy all values from the files into memory and keep them there: whatever becomes of the files after
  * that changes nothing. Where it fails with BF_CANNOT_LOCK, as always on Windows, they are copied all
- * the same; with BF_DAMAGED one is not finite, and a hand would feel a hole. Before the first question:
- * it must not run while a thread asks. */
+ * the same; with BF_DAMAGED one is not finite, and a hand would feel a hole; of a field that is not open
+ * it is BF_NOT_A_FIELD. Before the first question: it must not run while a thread asks. */
 bf_status bf_lock(bf_field *field);
 
 /* Give everything back; harmless twice. No thread may be asking any more. */
@@ -125,7 +126,7 @@ int bf_structure(const bf_field *field, const char *name);
 int bf_fixture(const bf_field *field, const char *name);
 
 /* Whether a point lies in the grid. What lies outside is answered for the nearest point of the grid's
- * boundary, and says less the farther out it is. */
+ * boundary, and says less the farther out it is. A field that is not open contains none. */
 int bf_contains(const bf_field *field, const double point_mm[3]);
 
 /* Signed distance in mm and its gradient in the frame of the MR; either may be NULL. */
@@ -182,7 +183,8 @@ double bf_outside_share(const bf_field *field, const bf_tool *tool, const double
 
 /* A moving fixture can push energy into the hand. A tank lets through only what it holds: energy
  * that the hand gives fills it, energy that the hand gets drains it, and where it is empty the part
- * of the force that would drive the motion on is withheld. Off unless it is used:
+ * of the force that would drive the motion on is withheld. What one tick's step takes where the motion
+ * begins or turns cannot be foreseen; it is owed. Off unless it is used:
  *
  *     bf_tank tank = bf_full_tank(5, 20);               5 mJ to begin with, 20 mJ at most
  *     each tick: bf_force(...); fade, clip to the device's force; bf_pass(&tank, point_mm, force_n);
@@ -201,18 +203,19 @@ typedef struct {
 } bf_tank;
 
 /* A tank that holds level_mj to begin with, and capacity_mj at most; what is no finite number, or
- * less than nothing, is 0: such a tank lets nothing pass that drives. */
+ * less than nothing, is 0: such a tank lets nothing pass that drives on. */
 bf_tank bf_full_tank(double level_mj, double capacity_mj);
 
-/* What may be rendered of a force, in place, at the tool's present point. Where one of them is not
- * finite, nothing may. */
+/* What may be rendered of a force, in place, at the tool's present point. Where a number of one of them
+ * is not finite, or beyond 1e100, nothing may. */
 void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3]);
 
 /* target = transform * point; the arrays may be the same. */
 void bf_transform(const double transform[16], const double point_mm[3], double moved_mm[3]);
 
 /* A direction, such as a force, in the target's frame as it is in the source's: turned back, not
- * shifted. The arrays may be the same. Zeros where something is not finite, as an unknown transform. */
+ * shifted. The arrays may be the same. Zeros where something is not finite, as an unknown transform; at
+ * its shift nobody looks. */
 void bf_turn_back(const double transform[16], const double vector[3], double turned[3]);
 
 /* Parse the text of a store's zarr.json; bf_open does it, this is for tests. */
@@ -294,7 +297,7 @@ const char *bf_text(bf_status status)
     case BF_NO_SUCH_NAME: return "no such structure or fixture";
     case BF_NOT_FINITE: return "a coordinate or phase is not finite";
     case BF_NOT_RIGID: return "mr_from_tool is no rotation and shift within 1e-3, row after row";
-    case BF_WRONG_BOUND: return "bound_n must be above 0";
+    case BF_WRONG_BOUND: return "bound_n must be above 0, and finite";
     case BF_REPLACED: return "the store was replaced while it was opened: open it again";
     }
     return "unknown status";
@@ -793,7 +796,7 @@ bf_status bf_describe(bf_field *field, const char *text, size_t length)
         else if (bf__is(key, span, "rr_s")) {
             int known = !bf__null(&j);
             field->rr_s = known ? bf__number(&j) : 0;
-            j.bad |= known && !(field->rr_s > 0);
+            j.bad |= known && !(field->rr_s > 0 && bf__numeric(field->rr_s));
         } else if (bf__is(key, span, "frame")) j.bad |= !bf__says(&j, "LPS");
         else if (bf__is(key, span, "unit")) j.bad |= !bf__says(&j, "mm");
         else if (bf__is(key, span, "periodic")) {
@@ -1083,6 +1086,29 @@ static bf_status bf__check(const bf__folder *folder, const char *text, size_t le
     return j.bad || !checked ? BF_NOT_A_FIELD : BF_OK;
 }
 
+/* Compare a manifest with its own digest, which is that of its text without the line that tells it. */
+static bf_status bf__sealed(const char *text, size_t length)
+{
+    char sha256[65];
+    const char *digest, *line, *end = text + length;
+    size_t span;
+    bf__json j;
+    bf__sha sha;
+    j.at = text;
+    j.end = end;
+    j.bad = 0;
+    if (!bf__find(&j, "sha256")) return BF_DAMAGED;
+    bf__string(&j, &digest, &span);
+    if (j.bad) return BF_DAMAGED;
+    for (line = digest; line > text && line[-1] != '\n';) line--;
+    bf__sha_start(&sha);
+    bf__sha_add(&sha, text, (size_t)(line - text));
+    for (line = digest + span; line < end && *line != '\n';) line++;
+    if (line < end) bf__sha_add(&sha, line + 1, (size_t)(end - line - 1));
+    bf__sha_end(&sha, sha256);
+    return bf__is(digest, span, sha256) ? BF_OK : BF_DAMAGED;
+}
+
 bf_status bf_verify(const char *path)
 {
     bf_field field;
@@ -1094,6 +1120,7 @@ bf_status bf_verify(const char *path)
     status = bf__manifest(&folder, &text, &length);
     if (status == BF_OK) {
         status = bf__check(&folder, text, length, NULL, NULL, 0);
+        if (status == BF_OK) status = bf__sealed(text, length);
         free(text);
     }
     bf__leave(&folder);
@@ -1251,6 +1278,9 @@ bf_status bf_lock(bf_field *field)
     bf_status status = BF_OK;
 #ifndef _WIN32
     int n, k;
+#endif
+    if (!field->structure) return BF_NOT_A_FIELD;
+#ifndef _WIN32
     if (!field->copied) status = bf__copy(field);
 #endif
     if (!bf__all_finite(field)) return BF_DAMAGED;
@@ -1891,7 +1921,7 @@ bf_status bf_forces(const bf_field *field, int fixture, size_t count, const doub
 
 int bf_contains(const bf_field *field, const double point_mm[3])
 {
-    int axis, inside = 1;
+    int axis, inside = field->structures > 0;
     for (axis = 0; axis < 3; axis++) {
         double low_mm = field->origin_mm[axis];
         double high_mm = low_mm + (field->shape[axis] - 1) * field->spacing_mm[axis];
@@ -2172,6 +2202,13 @@ bf_tank bf_full_tank(double level_mj, double capacity_mj)
 #define BF__LOW_TICKS 12
 #define BF__WITHHOLD 0.05
 #define BF__GIVE_BACK 0.005
+/* Millimetres or newtons beyond which no tool is and no device pushes: squares of larger ones may be infinite. */
+#define BF__NONE 1e100
+
+static int bf__known(const double v[3])
+{
+    return fabs(v[0]) <= BF__NONE && fabs(v[1]) <= BF__NONE && fabs(v[2]) <= BF__NONE;
+}
 
 /* Lessen a force by degrees while it drives and the tank is low; ahead is its work over the last way. What
  * a tool at rest did last stands, or a coarse encoder would tell one thing and the other by turns. Nor
@@ -2194,14 +2231,10 @@ static void bf__lessen(bf_tank *tank, double force_n[3], double *ahead)
 
 void bf_pass(bf_tank *tank, const double point_mm[3], double force_n[3])
 {
-    double way[3], way2 = 0, work = 0, ahead = 0, place = 0, wanted = 0, allowed, share;
-    int axis;
-    for (axis = 0; axis < 3; axis++) {
-        place += point_mm[axis];
-        wanted += force_n[axis];
-    }
-    if (!bf__numeric(place) || !bf__numeric(wanted)) force_n[0] = force_n[1] = force_n[2] = 0;
-    if (!bf__numeric(place)) {
+    double way[3], way2 = 0, work = 0, ahead = 0, allowed, share;
+    int axis, seen = bf__known(point_mm);
+    if (!seen || !bf__known(force_n)) force_n[0] = force_n[1] = force_n[2] = 0;
+    if (!seen) {
         tank->blind = 1;
         return;
     }

@@ -61,7 +61,7 @@ typedef struct {
 
 typedef struct {
     double cycle_rr_s, fade_per_s; /* the nominal beat; share of the force faded in a second */
-    double latency_s;              /* how long after its R a beat may be told: 0.14, or as you set it, to 1 s */
+    double latency_s;              /* how long after its R a beat may be told: 0.14, or yours, above 0 to 1 s */
     int withheld;                  /* 0; set it while no force is wanted, as of a tool outside the grid */
     double now_s;
     int started;
@@ -83,7 +83,7 @@ typedef struct {
 /* A clock that has seen nothing. fade_per_s: the fixture's force rate over its largest force. With a
  * cycle outside 0.2 to 3 s, or a rate that is not above 0 or not finite, it is never valid and its
  * fade stays 0. Of a monitor that tells beats later than 0.14 s after R, set clock.latency_s: a
- * beat that is overdue is noticed so much later (outside of 0 to 1 s: never valid, either). */
+ * beat that is overdue is noticed so much later (not above 0, or over 1 s: never valid, either). */
 bf_clock bf_new_clock(double cycle_rr_s, double fade_per_s);
 
 /* Go on for another field, with all that beats have told: another cycle and rate, as for bf_new_clock.
@@ -110,7 +110,8 @@ void bf_take_back(bf_clock *clock);
  * and set. More than 1e11 s are no time. */
 int bf_now(bf_clock *clock, double now_s, int usable, bf_tick *tick);
 
-/* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. */
+/* Phase of a beat of rr_s on the axis of a beat of cycle_rr_s. No number (which a field refuses) where
+ * the phase is none, or a length not above 0 or not finite, as field.rr_s where it is unknown. */
 double bf_to_cycle(double phase, double rr_s, double cycle_rr_s);
 
 #ifdef __cplusplus
@@ -172,6 +173,8 @@ static double bfc_kick(double rr_s) { return 1.0 - 0.12 / bfc_max(rr_s, 60.0 / 1
 double bf_to_cycle(double phase, double rr_s, double cycle_rr_s)
 {
     double from_end, from_kick, to_end, to_kick, a, b, sine, place;
+    if (!(rr_s > 0.0 && isfinite(rr_s) && cycle_rr_s > 0.0 && isfinite(cycle_rr_s)))
+        return (double)NAN;
     if (rr_s == cycle_rr_s)
         return phase;
     from_end = 1.0 / tan(BFC_PI * bfc_systole_share(rr_s));
@@ -182,7 +185,7 @@ double bf_to_cycle(double phase, double rr_s, double cycle_rr_s)
     a = to_end - b * from_end;
     sine = sin(BFC_PI * phase);
     place = atan2(sine, a * sine + b * cos(BFC_PI * phase)) / BFC_PI;
-    return place < 1.0 ? place : 0.0;
+    return place >= 1.0 ? 0.0 : place;
 }
 
 static double bfc_wrapped(double turns) { return turns - floor(turns + 0.5); }
