@@ -2,8 +2,8 @@
 
     python benchmarks/kill_and_resume.py STUDY [--kills 10] [--seed 0]
 
-Prints the moment and stage of each kill, and ends with exit code 1 where a byte differs. The
-timings in run.json are left out of the comparison.
+Prints the moment and stage of each kill, and ends with exit code 1 where a byte differs. Times
+and memory in run.json are left out of the comparison.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-TIMINGS = ("seconds", "peak_memory_mb")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from pipeline.run import MEASURED
 
 
 def command(study: Path, out: Path) -> list[str]:
@@ -28,7 +30,7 @@ def command(study: Path, out: Path) -> list[str]:
 
 
 def products(out: Path) -> dict[str, Any]:
-    """Every file below ``out``; run.json without its timings."""
+    """Every file below ``out``; run.json without what was measured."""
     content: dict[str, Any] = {}
     for path in sorted(out.rglob("*")):
         if path.is_file():
@@ -36,8 +38,8 @@ def products(out: Path) -> dict[str, Any]:
     for name in [name for name in content if name.endswith("run.json")]:
         record = json.loads(content[name])
         for stage in record["stages"].values():
-            for timing in TIMINGS:
-                stage.pop(timing, None)
+            for measured in MEASURED:
+                stage.pop(measured, None)
         content[name] = record
     return content
 

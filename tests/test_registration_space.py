@@ -132,6 +132,17 @@ class TestRegister:
         # The floor's variance grows by 1.6 squared, what the frames' spread adds does not.
         assert 1 < found.expected_mm / surer.expected_mm < 1.6
 
+    def test_what_a_model_lacks_is_named_beside_what_else_is_doubted(self, surfaces, recording):
+        """The frames alone call it good."""
+        chambers = {name: one for name, one in surfaces.items() if name != "aorta"}
+        loose = {"good_tre_mm": 50.0, "worst_tre_mm": 50.0, "candidates": 1, "starts": 1}
+        settings = QUICK.model_copy(update=loose)
+        given = recording.sweeps, recording.phases, chambers, recording.mr_from_tracker, settings
+        assert find(*given).reason == ""
+        found = register(*given, doubts=["the heart beats faster"])
+        assert found.verdict == "doubtful"
+        assert found.reason.startswith("the heart beats faster; the model lacks aorta")
+
     def test_pose_is_found_without_any_start(self, surfaces, recording):
         anywhere = QUICK.model_copy(update={"candidates_anywhere": 3000, "starts": 3})
         found = find(recording.sweeps, recording.phases, surfaces, None, anywhere)
@@ -283,7 +294,13 @@ class TestRefusals:
         near[:, :3, 3] = 0.1 + 0.01 * np.arange(14)[:, None]
         poses = recording.sweeps[0].tracker_from_image
         sweeps = [
-            SimpleNamespace(tracker_from_image=poses, tracker_from_probe=near, pose_frame="Tracker")
+            SimpleNamespace(
+                name="sweep",
+                times_s=timing.times_s[0],
+                tracker_from_image=poses,
+                tracker_from_probe=near,
+                pose_frame="Tracker",
+            )
         ]
         stop = type(wrong) is InputError or on_failure == "stop"
         with pytest.raises(type(wrong) if stop else Skipped, match=f"{wrong}; .*in metres"):

@@ -381,13 +381,16 @@ class TestVerdict:
 @pytest.mark.parametrize("verdict", ["good", "doubtful", "failed"])
 def test_doubts_are_told_before_other_reasons_and_mend_no_failure(monkeypatch, verdict):
     reason = "" if verdict == "good" else "far"
-    monkeypatch.setattr(space, "find", lambda *_: Result(verdict, reason))
+    found = space._doubted(Result(verdict, reason), ["mirrored"])
+    reasons = "; ".join(filter(None, ["mirrored", reason]))
+    assert found == Result("failed" if verdict == "failed" else "doubtful", reasons)
+    assert space._doubted(Result(verdict, reason), []) == Result(verdict, reason)
+    monkeypatch.setattr(space, "find", lambda *_: found)
     if verdict == "failed":
         with pytest.raises(StageError, match=r"^mirrored; far$"):
             space.register([], [], {}, None, doubts=["mirrored"])
         return
-    found = space.register([], [], {}, None, doubts=["mirrored"])
-    assert found == Result("doubtful", "; ".join(filter(None, ["mirrored", reason])))
+    assert space.register([], [], {}, None, doubts=["mirrored"]) == found
 
 
 @dataclass

@@ -45,7 +45,8 @@ _FOLLOWED = 0.1
 
 LOST_AFTER = 10
 """So many frames in a row that show a body and disagree are no chance: they show something else, or
-tracker or patient have moved farther than a frame's optimum reaches."""
+tracker or patient have moved farther than a frame's optimum reaches. Beside its place one frame in
+some agrees by chance, so that as many in a row have to agree before the pose is trusted again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +64,19 @@ class LiveState:
     """Running mean of the share of grey values that the model explains."""
 
     astray: int = 0
-    """How many frames in a row, up to now, show a body and do not agree."""
+    """How many frames in a row, up to now, show a body and do not agree; while the pose is lost,
+    how many in all."""
 
     picture: int = 0
     """Checksum of the last frame's grey values: shown again they tell nothing."""
 
+    agreed: int = 0
+    """How many frames in a row, up to now, agree since the pose was lost; 0 while it is not."""
+
     @property
     def lost(self) -> bool:
-        """Whether the pose, and its covariance, are to be trusted no longer (`LOST_AFTER`): the
-        next frame that agrees says that they are, or a new registration."""
+        """Whether the pose, and its covariance, are to be trusted no longer (`LOST_AFTER`): as many
+        frames in a row that agree say that they are, or a new registration."""
         return self.astray >= LOST_AFTER
 
 
@@ -192,11 +197,20 @@ class Follower:
             return self._left(state, waited)
         explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
         if not explained > _ODD_SHARE * state.usual:
-            return self._left(replace(state, astray=state.astray + 1), waited)
+            return self._left(replace(state, astray=state.astray + 1, agreed=0), waited)
         usual = state.usual + _FOLLOWED * (explained - state.usual)
         step, covariance = self._update(samples, state.mr_from_tracker, waited)
         pose = self.pivot.move(state.mr_from_tracker, step)
-        found = LiveState(pose, covariance + self.shared_mm2, usual, picture=picture)
+        agreed = state.agreed + 1 if state.lost else 0
+        lost = 0 < agreed < LOST_AFTER
+        found = LiveState(
+            pose,
+            covariance + self.shared_mm2,
+            usual,
+            astray=state.astray if lost else 0,
+            picture=picture,
+            agreed=agreed if lost else 0,
+        )
         return self._drift(found, used=True)
 
     def _left(self, state: LiveState, waited: Float) -> Drift:

@@ -202,11 +202,7 @@ def register(
         When the verdict is worse than the settings accept, or the network cannot be loaded.
     """
     settings = settings or RegisterSettings()
-    found = find(sweeps, phases, surfaces, start, settings, progress, timing, cine)
-    if doubts:
-        verdict: Grade = "failed" if found.verdict == "failed" else "doubtful"
-        reasons = filter(None, [*doubts, found.reason])
-        found = replace(found, verdict=verdict, reason="; ".join(reasons))
+    found = find(sweeps, phases, surfaces, start, settings, progress, timing, cine, doubts)
     if found.verdict == "failed":
         raise StageError(found.reason)
     if found.verdict == "doubtful" and settings.accept == "good":
@@ -223,6 +219,7 @@ def find(
     progress: Progress | None = None,
     timing: Timing | None = None,
     cine: Cine | None = None,
+    doubts: Sequence[str] = (),
 ) -> Registration:
     """As `register`, but a failed registration is returned with its verdict and its reason.
 
@@ -275,9 +272,18 @@ def find(
         size, apart, contradicted, clocks, misplaced,
     )  # fmt: skip
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
-    result = _summarise(found, search, sizes, heart_mm)
+    result = _doubted(_summarise(found, search, sizes, heart_mm), doubts)
     tell(_STEPS, _STEPS)
     return _naming_what_is_unknown(result, lacking, open_above, cut)
+
+
+def _doubted(result: Registration, doubts: Sequence[str]) -> Registration:
+    """The result, none that is good where anything is known to speak against it."""
+    if not doubts:
+        return result
+    verdict: Grade = "failed" if result.verdict == "failed" else "doubtful"
+    reasons = filter(None, [*doubts, result.reason])
+    return replace(result, verdict=verdict, reason="; ".join(reasons))
 
 
 def _naming_what_is_unknown(

@@ -29,7 +29,7 @@ BLOOD = ("lv_endocardium", "rv_endocardium", "left_atrium", "right_atrium", "aor
 """The structures that hold blood."""
 
 # The beam hears tissue this far beside it (standard deviation, there and back), and blood's echo is
-# some 26 dB under muscle's: what is heard of a tenth of muscle is nearly as bright as all of it.
+# some 26 dB under muscle's: what is heard of a sixth of muscle is half as bright as all of it.
 _BEAM_MM, _ECHO_OF_BLOOD = 1.0, 0.05
 # Half the width of the bright line that an interface leaves: pulse, beam and slope together.
 _WALL_MM = 2.0
