@@ -140,6 +140,17 @@ def test_a_nifti_header_that_claims_more_than_memory_is_refused(
         read_nifti_cine(path, None, 900.0)
 
 
+def test_a_nifti_image_of_more_pixels_than_any_scanner_makes_is_refused(tmp_path: Path) -> None:
+    header = nibabel.Nifti1Header()
+    header.set_data_dtype(np.uint8)
+    header.set_data_shape((4097, 4096, 3, 2))
+    header["magic"], header["vox_offset"] = b"n+1", 352
+    path = tmp_path / "cine.nii"
+    path.write_bytes(header.binaryblock + bytes(1000))
+    with pytest.raises(InputError, match=r"cine\.nii: one image: its header tells of 1\.68e"):
+        read_nifti_cine(path, None, 900.0)
+
+
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [("Columns", 65535, "one image: its header"), ("NumberOfFrames", 2**31 - 1, "1.03e.11 values")],

@@ -65,3 +65,20 @@ def test_exchanged_axes_are_named_with_their_file(tmp_path: Path) -> None:
     saved(tmp_path / "p" / "cine" / "cine.nii.gz", chest(8).swapaxes(2, 3), 0.15, "sec")
     with pytest.raises(InputError, match=r"cine\.nii\.gz: its axes of slices and phases look exch"):
         ingested(tmp_path / "p")
+
+
+def test_spoilt_slices_are_counted_as_messages_do_without_blank_ends(tmp_path: Path) -> None:
+    data = chest()
+    padded = np.concatenate([np.zeros_like(data[:, :, :1]), data], axis=2)
+    padded[:, :, 4] = padded[:, :, 2]
+    saved(tmp_path / "p" / "cine" / "cine.nii.gz", padded, 0.15, "sec")
+    words = r"slices 1 and 3 show the same images.*cine\.spoilt_slices: \[3\]"
+    with pytest.raises(InputError, match=words) as refused:
+        ingested(tmp_path / "p")
+    assert "slice 1 of the files is slice 0 from here on" in refused.value.__notes__[0]
+    (tmp_path / "out").rmdir()
+    (tmp_path / "p" / "study.yaml").write_text("cine: {spoilt_slices: [3]}\n")
+    cine = read_cine(ingested(tmp_path / "p")[0])
+    assert cine.interpolated == (3,)
+    mean = (data[:, :, 2] + data[:, :, 4]) / 2
+    np.testing.assert_allclose(cine.intensity.T[:, :, 3], mean, rtol=1e-6)

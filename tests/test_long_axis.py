@@ -81,8 +81,10 @@ def test_views_are_cines_across_the_stack_in_its_own_frame_of_reference(tmp_path
     np.testing.assert_allclose(view.phases, np.arange(PHASES) * RR_MS / PHASES / 1000)
     assert view.rr_s == 1.0
     np.testing.assert_allclose(view.mr_from_index[:3, 0], [0, 1.25, 0], atol=1e-9)
-    *apart, why = stack.left_out
+    *apart, derived_why, why = stack.left_out
     assert len(apart) == 5
+    told = 'series 54 "view 4": no long-axis view: its images are derived, and no original ones'
+    assert derived_why == told
     assert why.startswith('series 51 "view 1": no long-axis view: it has another Frame')
 
 
@@ -149,6 +151,16 @@ def test_a_series_of_two_images_at_each_time_is_no_view(tmp_path: Path) -> None:
     assert views == ()
     reason = 'series 50 "view 0": no long-axis view: it shows two images at 0 ms'
     assert stack.left_out[-1] == reason
+
+
+def test_a_view_beside_velocities_in_its_series_is_no_other_kind(tmp_path: Path) -> None:
+    write_dicom(tmp_path)
+    add_view(tmp_path, 0)
+    velocity = {"ImageType": ["ORIGINAL", "PRIMARY", "P"], "SeriesNumber": 50}
+    add_view(tmp_path, 1, SeriesInstanceUID="1.2.3.50", SeriesDescription="view 0", **velocity)
+    stack, views = read_dicom_study(tmp_path)
+    assert [view.name for view in views] == ['series 50 "view 0"']
+    assert not any("no long-axis view" in line for line in stack.left_out)
 
 
 def test_a_view_is_timed_by_what_tells_its_images_apart(tmp_path: Path) -> None:

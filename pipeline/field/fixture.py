@@ -101,7 +101,7 @@ class Fixture(Section):
 
     device: Device = DEVICES["touch"]
     """The haptic device that will render the force: touch, falcon, omega7, or one of one's own,
-    as {name: mine, force_n: 10, stiffness_n_per_m: 2000}; null where no stiffness is known."""
+    as {name: mine, force_n: 10, stiffness_n_per_m: 2000}, its stiffness null if not known."""
 
     @field_validator("device", mode="before")
     @classmethod
@@ -263,4 +263,4 @@ class BakeSettings(Section):
     """How exact the finished field must be."""
 
     largest_store_mb: float = Field(default=4000.0, gt=0)
-    """A field that would take more on disk is refused before work begins."""
+    """A field that would take more on disk is refused as its stage begins."""

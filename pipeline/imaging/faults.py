@@ -144,7 +144,9 @@ def without_blank_ends(stack: Stack) -> Stack:
     """The stack without the slices at its ends that show nothing in any phase, as some data sets
     pad theirs; what was left out is told."""
     cine = stack.cine
-    blank = (np.ptp(cine.intensity, axis=(2, 3)) == 0).all(axis=0)
+    # Infinite values less themselves are no numbers, and refused later on.
+    with np.errstate(invalid="ignore"):
+        blank = (np.ptp(cine.intensity, axis=(2, 3)) == 0).all(axis=0)
     shown = np.flatnonzero(~blank)
     # Where hardly any slice shows something, that is for whoever looks at the images to say.
     if len(shown) < MIN_SLICES or not (blank[0] or blank[-1]):

@@ -18,6 +18,7 @@ from pipeline.imaging.frames import (
     ORIGINAL,
     PARALLEL_COSINE,
     Frame,
+    count_moments,
 )
 from pipeline.imaging.phases import PLAUSIBLE_RR_S
 
@@ -59,9 +60,13 @@ def long_axis_views(
     examination = _most(frame.study for frame in along)
     slices: list[list[Frame]] = []
     elsewhere: list[Frame] = []
+    others: list[Frame] = []
     for frame in sorted(frames, key=lambda one: one.where):
         across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
-        if not across or frame.kind != ORIGINAL:
+        if not across:
+            continue
+        if frame.kind != ORIGINAL:
+            others.append(frame)
             continue
         told = frame.frame_of_reference
         if told not in ("", reference) or (not told and frame.study not in ("", examination)):
@@ -75,6 +80,13 @@ def long_axis_views(
     found = [_views(one) for one in slices]
     views = tuple(view for some, _ in found for view in some)
     reasons = [reason for _, some in found for reason in some]
+    # A series may hold velocities beside the images of a view.
+    seen = {view.name for view in views}
+    reasons += [
+        f"{one[0].series}: no long-axis view: its images are {one[0].kind}, and no original ones"
+        for one in _by_series(others)
+        if max(count_moments(one)) >= MIN_PHASES and one[0].series not in seen
+    ]
     reasons += [
         f"{one[0].series}: no long-axis view: it has another FrameOfReferenceUID than the stack, "
         "or none and another StudyInstanceUID, as of a patient laid down anew; if a program that "

@@ -22,7 +22,7 @@ from pipeline.errors import InputError
 from pipeline.geometry import Float
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.frames import MIN_PHASES, MIN_SLICES
-from pipeline.imaging.limits import FARTHEST_MM, require_bounded
+from pipeline.imaging.limits import FARTHEST_MM, MOST_PIXELS, require_bounded
 from pipeline.imaging.long_axis_series import LongAxis
 from pipeline.imaging.nifti_doubts import (
     doubts_of_place,
@@ -259,7 +259,9 @@ def _load(path: Path) -> Any:
         raise InputError(
             f"{path}: cannot be read as NIfTI ({error}); copy or convert it again"
         ) from error
-    require_bounded(math.prod(int(size) for size in image.shape), str(path))
+    sizes = [int(size) for size in image.shape]
+    require_bounded(math.prod(sizes), str(path))
+    require_bounded(math.prod(sizes[:2]), f"{path}: one image", MOST_PIXELS)
     edges_mm = as_stored["pixdim"][1:4]
     if as_stored["sform_code"] <= 0 and not np.all(np.abs(edges_mm) > 0):
         raise InputError(

@@ -49,15 +49,9 @@ def run(job: Job) -> dict[str, Any]:
     else:
         stack = read_nifti_cine(files.path, files.timing, files.rr_ms)
         views = read_nifti_views(job.study.long_axis, files.rr_ms)
-    where = f"{job.study.folder / 'study.yaml'}: cine.spoilt_slices"
-    stack = replace(stack, cine=redraw_slices(stack.cine, files.spoilt_slices, where))
     cine, unrecorded = without_unrecorded(stack.cine, "the cine")
     stack = replace(stack, cine=cine, remarks=(*stack.remarks, *unrecorded))
-    require_finite(stack.cine, str(files.path))
-    if not files.path.is_dir():
-        require_slices_before_phases(stack.cine, str(files.path))
-    stack = without_blank_ends(stack)
-    copies = require_different_images(stack.cine, str(files.path))
+    stack, copies = _of_usable_slices(job, stack)
     views, told_of_views = _views_of_numbers(views)
     ecg = None if job.study.ecg.mr is None else read_ecg(job.study.ecg.mr)
     _require_ecg_as_long(job, stack, ecg)
@@ -86,6 +80,24 @@ def run(job: Job) -> dict[str, Any]:
         "patient_mark": patient_mark(stack.patient),
         "long_axis": [view.name for view in views],
     }
+
+
+def _of_usable_slices(job: Job, stack: Stack) -> tuple[Stack, tuple[str, ...]]:
+    """The stack without blank ends and with its spoilt slices drawn anew, and which phases are
+    copies. ``cine.spoilt_slices`` counts as all messages do: blank ends have no number."""
+    files, before = job.study.cine, len(stack.remarks)
+    stack = without_blank_ends(stack)
+    where = f"{job.study.folder / 'study.yaml'}: cine.spoilt_slices"
+    try:
+        stack = replace(stack, cine=redraw_slices(stack.cine, files.spoilt_slices, where))
+        require_finite(stack.cine, str(files.path))
+        if not files.path.is_dir():
+            require_slices_before_phases(stack.cine, str(files.path))
+        return stack, require_different_images(stack.cine, str(files.path))
+    except InputError as error:
+        for remark in stack.remarks[before:]:
+            error.add_note(remark)
+        raise
 
 
 def _views_of_numbers(views: Sequence[LongAxis]) -> tuple[tuple[LongAxis, ...], list[str]]:
