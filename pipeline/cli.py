@@ -59,12 +59,16 @@ def _run(
     from pipeline.config import read_settings
     from pipeline.publish import standing_products
     from pipeline.run import run_study
-    from pipeline.study import open_study
+    from pipeline.study import open_study, studies_in
 
     try:
         settings, opened = read_settings(config), open_study(study)
     except InputError as error:
-        for products in standing_products(study, out):
+        # The only study in a folder is what that folder means; of several none was meant.
+        readable = study.is_dir() and os.access(study, os.R_OK | os.X_OK)
+        inside = studies_in(study) if readable else []
+        meant = [study, *inside] if len(inside) == 1 else [study]
+        for products in standing_products(meant, out):
             error.add_note(f"{products} holds products of another run; {NOT_TO_BE_USED}")
         raise
     return run_study(opened, settings, out, Console(), first, last)

@@ -11,7 +11,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -254,15 +254,14 @@ def read_record(products: Path | None) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def standing_products(study: Path, out: Path) -> list[Path]:
-    """The folders in ``out`` with products of a study, which may no longer be understood: its
-    ``run.json`` names the study's folder, or one in it."""
-    folder = study.resolve()
+def standing_products(folders: Collection[Path], out: Path) -> list[Path]:
+    """The folders in ``out`` with products of a study that may no longer be understood: their
+    ``run.json`` names one of ``folders``."""
+    named = {str(folder.resolve()) for folder in folders}
     return [
         products
         for products in sorted(path.parent for path in out.glob("*/run.json"))
-        if isinstance(made_of := read_record(products).get("study"), str)
-        and folder in (Path(made_of), Path(made_of).parent)
+        if isinstance(made_of := read_record(products).get("study"), str) and made_of in named
     ]
 
 

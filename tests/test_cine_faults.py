@@ -8,6 +8,7 @@ from typing import Any
 
 import nibabel
 import numpy as np
+import pydicom
 import pytest
 from cine_files import dicom_frame, write_dicom
 from pydicom.dataset import Dataset
@@ -341,6 +342,20 @@ def test_slices_of_two_patients_are_no_stack(tmp_path: Path, told: str) -> None:
     assert not any(value in str(error.value) for value in values)
     write_dicom(tmp_path / "other", told_by_half(**{told: (values[0], "")}))
     read_dicom_study(tmp_path / "other")
+
+
+@pytest.mark.parametrize("other", ["1950.01.01", "1950", "00000000", "ANON"])
+def test_dates_of_birth_written_otherwise_or_blotted_out_are_of_one_patient(
+    tmp_path: Path, other: str
+) -> None:
+    def change(data: Any, number: int, phase: int) -> bool:
+        value = "19500101" if number < 2 else other
+        with pydicom.config.disable_value_validation():
+            data.PatientBirthDate = value
+        return True
+
+    write_dicom(tmp_path, change)
+    read_dicom_study(tmp_path)
 
 
 def test_a_stack_knows_its_patient(tmp_path: Path) -> None:

@@ -266,6 +266,21 @@ def test_a_packed_cine_that_is_not_what_its_checksum_says_is_refused(
         read_nifti_cine(path, None, 800)
 
 
+@pytest.mark.parametrize("behind", [bytes(512), b"\n", gzip.compress(b"")])
+def test_what_comes_behind_a_packed_cine_is_nobodys(tmp_path: Path, behind: bytes) -> None:
+    path = tmp_path / "cine.nii.gz"
+    voxels = np.random.default_rng(5).integers(0, 999, (64, 64, 4, 3)).astype(np.int16)
+    content = nibabel.Nifti1Image(voxels, np.diag([1.5, 1.5, 8, 1])).to_bytes()
+    whole = gzip.compress(content[:5000]) + gzip.compress(content[5000:])
+    path.write_bytes(whole + behind)
+    assert read_nifti_cine(path, None, 800).cine.intensity.shape == (3, 4, 64, 64)
+    flipped = bytearray(whole)
+    flipped[-6] ^= 4
+    path.write_bytes(bytes(flipped) + behind)
+    with pytest.raises(InputError, match="truncated or damaged"):
+        read_nifti_cine(path, None, 800)
+
+
 def test_an_ecg_that_promises_more_than_it_describes_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "us.hea").write_text("us 99999999 500 3400\nus.dat 16 200 16 0 0 0 0 II\n")
     (tmp_path / "us.dat").write_bytes(bytes(6800))

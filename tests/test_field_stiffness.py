@@ -1,6 +1,7 @@
 """How fast the force changes with place: the law's rates, and those of a field, on known shapes."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -255,6 +256,30 @@ def test_nowhere_does_a_force_change_faster_than_stated(tmp_path, distance):
     assert turned_per_mm.max() <= turning_per_mm
     change_n = np.linalg.norm(field.force_n(there, 0.0) - field.force_n(here, 0.0), axis=1)
     assert 0.1 < change_n.max() / step_mm <= rate_bound_n_per_mm(fixture, longest, turning_per_mm)
+
+
+def test_differences_that_single_precision_rounds_are_within_the_limits(tmp_path):
+    """Of numbers of unlike size, whose differences have more digits than a float32."""
+    field = write_field(tmp_path / "f.zarr", points_in_space, law(1, delta_mm=0.5))
+    shape, rng = field.grid.shape, np.random.default_rng(9)
+    for _ in range(20):
+        # A float64 holds them, and all their differences.
+        values = np.zeros(shape, np.float32)
+        values[:2, :2, :2] = rng.normal(size=(2, 2, 2)) * 10 ** rng.uniform(-3, 1, (2, 2, 2))
+        values[2:] = values[1]
+        values[:, 2:] = values[:, 1:2]
+        values[:, :, 2:] = values[:, :, 1:2]
+        fake = SimpleNamespace(
+            phases=[0.0], grid=field.grid, stored_coefficients=lambda *_, values=values: values
+        )
+        longest, turning_per_mm = spline_limits(fake, "s")
+        exact = values.astype(np.float64)
+        steps = [np.diff(exact, axis=2 - axis) for axis in range(3)]
+        length = math.hypot(*(np.abs(one).max() for one in steps)) / SPACING_MM
+        bent = [[np.abs(np.diff(a, axis=2 - b)).max() for b in range(3)] for a in steps]
+        turning = np.linalg.eigvalsh(np.array(bent))[-1] / SPACING_MM**2
+        assert length <= longest <= length * (1 + 1e-6)
+        assert turning <= turning_per_mm <= turning * (1 + 1e-5)
 
 
 def test_the_stated_rate_is_that_of_the_coefficients(tmp_path):

@@ -163,6 +163,23 @@ def test_a_view_beside_velocities_in_its_series_is_no_other_kind(tmp_path: Path)
     assert not any("no long-axis view" in line for line in stack.left_out)
 
 
+def test_velocities_beside_original_images_that_are_no_view_are_not_told_as_alone(
+    tmp_path: Path,
+) -> None:
+    """The images of both times have no RR interval, and that is why there is no view."""
+    write_dicom(tmp_path)
+    no_rr = {"NominalInterval": None, "HeartRate": None}
+    add_view(tmp_path, 0, **no_rr)
+    velocity = {"ImageType": ["ORIGINAL", "PRIMARY", "P"], "SeriesNumber": 50}
+    named = {"SeriesInstanceUID": "1.2.3.50", "SeriesDescription": "view 0"}
+    add_view(tmp_path, 1, **named, **velocity, **no_rr)
+    stack, views = read_dicom_study(tmp_path)
+    assert views == ()
+    told = [line for line in stack.left_out if "no long-axis view" in line]
+    assert len(told) == 1
+    assert "no RR interval" in told[0]
+
+
 def test_a_view_is_timed_by_what_tells_its_images_apart(tmp_path: Path) -> None:
     write_dicom(tmp_path)
     for phase in range(PHASES):

@@ -287,6 +287,15 @@ def test_a_run_that_is_refused_at_once_tells_of_what_stands(
     (other / "study.yaml").write_text("nothing: known\n")
     assert main(["run", str(other), "--out", str(kitchen.out)]) == 2
     assert "note:" not in capsys.readouterr().err
+    # A folder with one study means it; of several none was meant.
+    above = kitchen.folder.parent
+    assert main(["run", str(above), "--out", str(kitchen.out)]) == 2
+    assert f"note: {kitchen.out / 'p1'} holds" in capsys.readouterr().err
+    (above / "p2" / "cine").mkdir(parents=True)
+    assert main(["run", str(above), "--out", str(kitchen.out)]) == 2
+    said = capsys.readouterr().err
+    assert "holds 2 studies" in said
+    assert "note:" not in said
 
 
 def test_a_field_of_an_earlier_run_is_told(kitchen: Kitchen, tmp_path: Path) -> None:

@@ -202,6 +202,9 @@ def test_a_probe_that_is_suddenly_elsewhere_and_stays_there_is_told(rng):
     told = leaps([recording(poses), recording(moved)])
     assert len(told) == 1
     assert "s: the probe leaps by 150 mm within 50 ms after 3.95 s" in told[0]
+    # A wrong pose nearby hides nothing.
+    moved[[17, 22], 2, 3] += 400
+    assert "leaps by 150 mm within 50 ms after 3.95 s" in leaps([recording(moved)])[0]
     # By less a hand may be, or what the tracker measures; what it measures wrongly comes back.
     slower = poses.copy()
     slower[20:, 1, 3] += 90
@@ -214,3 +217,15 @@ def test_a_probe_that_is_suddenly_elsewhere_and_stays_there_is_told(rng):
     late = poses.copy()
     late[-3:, 1, 3] += 150
     assert leaps([recording(late)]) == []
+
+
+def test_a_tracker_slower_than_the_pictures_is_no_probe_that_leaps(rng):
+    """Pictures every 0.01 s, poses every 0.2 s of a hand at 0.15 m/s: 30 mm apart."""
+    number = np.arange(COUNT)
+    poses = swept(rng)
+    poses[:, :3, 3] = [100, -50, 30]
+    poses[:, 0, 3] += 30 * (number // 20)
+    times_s = 3 + 0.01 * number
+    assert leaps([replace(recording(poses), times_s=times_s)]) == []
+    poses[40:, 1, 3] += 500
+    assert len(leaps([replace(recording(poses), times_s=times_s)])) == 1

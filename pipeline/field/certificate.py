@@ -120,6 +120,11 @@ def spline_limits(volume: ForceField, structure: str) -> tuple[float, float]:
     first, second = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
     for index in range(len(volume.phases)):
         largest_differences(volume.stored_coefficients(structure, index), first, second)
+    first, second = first.astype(np.float64), second.astype(np.float64)
+    # Differences in single precision are rounded: each by half of this share of what it is of.
+    rounding = float(np.finfo(np.float32).eps)
+    second += 2 * rounding * (first.max() + second)
+    first += rounding * first
     spacing_mm = np.array(volume.grid.spacing_mm)
     turning = np.linalg.eigvalsh(second / np.outer(spacing_mm, spacing_mm))
     return float(np.linalg.norm(first / spacing_mm)), float(turning[-1])

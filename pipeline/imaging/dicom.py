@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -303,7 +304,7 @@ def _frame(
             kind=_kind(dataset, group("MRImageFrameTypeSequence")),
             frame_of_reference=str(dataset.get("FrameOfReferenceUID", "") or ""),
             patient=str(dataset.get("PatientID", "") or "").strip(),
-            born=str(dataset.get("PatientBirthDate", "") or "").strip(),
+            born=_born(dataset),
             number=_number(dataset, group, place),
             study=str(dataset.get("StudyInstanceUID", "") or ""),
             acquisition=_acquisition(dataset, group),
@@ -363,6 +364,16 @@ def _series_name(dataset: Any) -> str:
     number, title = _series_number(dataset), dataset.get("SeriesDescription")
     name = "images of an unnumbered series" if number is None else f"series {number}"
     return f'{name} "{title}"' if title else name
+
+
+def _born(dataset: Any) -> str:
+    """The patient's date of birth as eight digits; empty where it is no date, as of a patient whom
+    somebody made anonymous."""
+    told = str(dataset.get("PatientBirthDate", "") or "").strip()
+    # Of old, dates had dots.
+    found = re.fullmatch(r"(\d{4})([.-]?)(\d\d)\2(\d\d)", told, re.ASCII)
+    date = "".join(found.group(1, 3, 4)) if found else ""
+    return date if date.strip("0") else ""
 
 
 def _kind(dataset: Any, frame_type: Any) -> str:

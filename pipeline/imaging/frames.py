@@ -71,7 +71,7 @@ class Frame:
     """The patient's identifier; empty when the file does not tell."""
 
     born: str = ""
-    """The patient's date of birth; empty when the file does not tell."""
+    """The patient's date of birth, YYYYMMDD; empty when the file does not tell."""
 
     study: str = ""
     """What tells apart a patient's examinations; empty when the file does not."""

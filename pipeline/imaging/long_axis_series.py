@@ -80,12 +80,12 @@ def long_axis_views(
     found = [_views(one) for one in slices]
     views = tuple(view for some, _ in found for view in some)
     reasons = [reason for _, some in found for reason in some]
-    # A series may hold velocities beside the images of a view.
-    seen = {view.name for view in views}
+    # A series may hold velocities beside original images, which are a view, or told of themselves.
+    seen = {frame.series_uid for one in [*slices, elsewhere] for frame in one}
     reasons += [
         f"{one[0].series}: no long-axis view: its images are {one[0].kind}, and no original ones"
         for one in _by_series(others)
-        if max(count_moments(one)) >= MIN_PHASES and one[0].series not in seen
+        if max(count_moments(one)) >= MIN_PHASES and one[0].series_uid not in seen
     ]
     reasons += [
         f"{one[0].series}: no long-axis view: it has another FrameOfReferenceUID than the stack, "

@@ -35,7 +35,7 @@ _FRAME_KEY = re.compile(r"Seq_Frame(\d+)_(\w+)")
 # these is in metres.
 _STILL_MM, _TOO_NEAR_MM = 1.0, 10.0
 # No hand moves a probe as fast; time stamps jitter, so a short way is no leap however short the
-# time; and so many steps on either side are a hand's again.
+# time; and by so many frames on either side it is known where the probe was.
 _FASTEST_MM_S, _LEAP_MM, _STAYS = 2000.0, 20.0, 5
 # Logarithm of width over height of a pixel that is told of: calibrations are off by some per cent,
 # pixels of television are 7 % wider or 9 % narrower than high.
@@ -282,18 +282,36 @@ def leaps(sweeps: Sequence[Sweep]) -> list[str]:
     told = []
     for sweep in sweeps:
         steps_s = np.diff(sweep.times_s)
-        ways_mm = np.linalg.norm(np.diff(sweep.tracker_from_probe[:, :3, 3], axis=0), axis=1)
-        fast = np.flatnonzero(ways_mm > np.maximum(_FASTEST_MM_S * steps_s, _LEAP_MM))
-        apart = np.diff(fast, prepend=-1, append=len(steps_s))
-        alone = fast[(apart[:-1] > _STAYS) & (apart[1:] > _STAYS)]
-        if len(alone):
-            k = int(alone[ways_mm[alone].argmax()])
+        places_mm = sweep.tracker_from_probe[:, :3, 3]
+        ways_mm = np.linalg.norm(np.diff(places_mm, axis=0), axis=1)
+        # Poses of a slow tracker stand still for some frames, and then make up for it in one.
+        anew_s = np.diff(sweep.times_s[1:][ways_mm > 0])
+        since_s = np.maximum(steps_s, np.median(anew_s) if len(anew_s) else 0.0)
+        fast = np.flatnonzero(ways_mm > np.maximum(_FASTEST_MM_S * since_s, _LEAP_MM))
+        stays = [
+            (_between_middles_mm(places_mm, int(k)), int(k))
+            for k in fast
+            if _STAYS <= k + 1 <= len(places_mm) - _STAYS
+        ]
+        way_mm, k = max(stays, default=(0.0, 0))
+        if way_mm > _LEAP_MM:
             told.append(
-                f"{sweep.name}: the probe leaps by {ways_mm[k]:.0f} mm within "
+                f"{sweep.name}: the probe leaps by {way_mm:.0f} mm within "
                 f"{1000 * steps_s[k]:.0f} ms after {sweep.times_s[k]:.2f} s and stays there: was "
                 "the tracker or its reference moved? Cut the sweep there"
             )
     return told
+
+
+def _between_middles_mm(places_mm: Float, k: int) -> float:
+    """How far the middle of the places up to number k is from that of those after it, where the
+    step between them is most of that way; 0 elsewhere. A wrong place or two do not move a median.
+    """
+    before = np.median(places_mm[k + 1 - _STAYS : k + 1], axis=0)
+    after = np.median(places_mm[k + 1 : k + 1 + _STAYS], axis=0)
+    way_mm = float(np.linalg.norm(after - before))
+    off_mm = float(np.linalg.norm(places_mm[k + 1] - places_mm[k] - (after - before)))
+    return way_mm if off_mm < way_mm / 2 else 0.0
 
 
 def _is_uncalibrated(sweep: Sweep) -> bool:
