@@ -2,7 +2,7 @@
  *
  *     clang -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all \
  *         -I pipeline/field/include tests/fuzz/fuzz_field.c -o fuzz_field -lm
- *     mkdir -p corpus && python tests/fuzz/seeds.py corpus
+ *     mkdir -p corpus && export BF_FUZZ_FOLDER="$(python tests/fuzz/seeds.py corpus)"
  *     ./fuzz_field corpus -dict=tests/fuzz/field.dict -max_len=8192 -max_total_time=900
  *
  * The first byte of an input chooses what it is: 0 a description as text; 1 a manifest beside a
