@@ -13,6 +13,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,19 +60,27 @@ def _run(
     from pipeline.config import read_settings
     from pipeline.publish import standing_products
     from pipeline.run import run_study
-    from pipeline.study import open_study, studies_in
+    from pipeline.study import open_study
 
     try:
         settings, opened = read_settings(config), open_study(study)
     except InputError as error:
-        # The only study in a folder is what that folder means; of several none was meant.
-        readable = study.is_dir() and os.access(study, os.R_OK | os.X_OK)
-        inside = studies_in(study) if readable else []
-        meant = [study, *inside] if len(inside) == 1 else [study]
-        for products in standing_products(meant, out):
+        for products in standing_products(_meant(study), out):
             error.add_note(f"{products} holds products of another run; {NOT_TO_BE_USED}")
         raise
     return run_study(opened, settings, out, Console(), first, last)
+
+
+def _meant(folder: Path) -> Path:
+    """A study that may not be understood: the folder, or the only study in it; of several none is
+    meant."""
+    from pipeline.study import is_study, studies_in
+
+    # Where they cannot be looked at, that is not what is to be told.
+    with suppress(OSError):
+        if folder.is_dir() and not is_study(folder) and len(inside := studies_in(folder)) == 1:
+            return inside[0]
+    return folder
 
 
 def _stage_name(name: str | None) -> str | None:

@@ -11,7 +11,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -254,15 +254,12 @@ def read_record(products: Path | None) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def standing_products(folders: Collection[Path], out: Path) -> list[Path]:
+def standing_products(study: Path, out: Path) -> list[Path]:
     """The folders in ``out`` with products of a study that may no longer be understood: their
-    ``run.json`` names one of ``folders``."""
-    named = {str(folder.resolve()) for folder in folders}
-    return [
-        products
-        for products in sorted(path.parent for path in out.glob("*/run.json"))
-        if isinstance(made_of := read_record(products).get("study"), str) and made_of in named
-    ]
+    ``run.json`` names its folder."""
+    folder = str(study.resolve())
+    found = sorted(path.parent for path in out.glob("*/run.json"))
+    return [products for products in found if read_record(products).get("study") == folder]
 
 
 def stale_words(field: Path) -> str:

@@ -10,7 +10,7 @@ import nibabel
 import numpy as np
 import pydicom
 import pytest
-from cine_files import dicom_frame, write_dicom
+from cine_files import PHASES, SLICES, dicom_frame, write_dicom
 from pydicom.dataset import Dataset
 
 from pipeline.errors import InputError
@@ -355,7 +355,8 @@ def test_dates_of_birth_written_otherwise_or_blotted_out_are_of_one_patient(
         return True
 
     write_dicom(tmp_path, change)
-    read_dicom_study(tmp_path)
+    stack, _ = read_dicom_study(tmp_path)
+    assert stack.cine.intensity.shape[:2] == (PHASES, SLICES)
 
 
 def test_a_stack_knows_its_patient(tmp_path: Path) -> None:

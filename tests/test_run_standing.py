@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import shutil
@@ -272,7 +273,10 @@ def test_files_that_vanish_while_the_study_runs_are_told(kitchen: Kitchen, left:
 
 
 def test_a_run_that_is_refused_at_once_tells_of_what_stands(
-    kitchen: Kitchen, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kitchen: Kitchen,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kitchen.run()
     (kitchen.folder / "study.yaml").write_text("patient_id: p1\ncine: {path: other.nii}\n")
@@ -296,6 +300,15 @@ def test_a_run_that_is_refused_at_once_tells_of_what_stands(
     said = capsys.readouterr().err
     assert "holds 2 studies" in said
     assert "note:" not in said
+
+    def closed(folder: Path) -> list[Path]:
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    # What cannot be looked into hides nothing of what is wrong.
+    monkeypatch.setattr("pipeline.study.studies_in", closed)
+    given = [str(above), "--out", str(kitchen.out), "--config", str(tmp_path / "none.yaml")]
+    assert main(["run", *given]) == 2
+    assert "none.yaml" in capsys.readouterr().err
 
 
 def test_a_field_of_an_earlier_run_is_told(kitchen: Kitchen, tmp_path: Path) -> None:
