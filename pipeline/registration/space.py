@@ -266,7 +266,8 @@ def find(
     apart = _apart(everything, pose, search.pivot, sizes)
     contradicted = _dissent(search, compared, everything, pose, bears_out, sizes)
     looked_at = timing if settings.clock_offset != "ignore" else None
-    clocks = clocks_apart(everything, pose, search.pivot, looked_at)
+    of_heart = _of_sweeps_of_the_heart(everything, pose, sizes, settings)
+    clocks = clocks_apart(of_heart, pose, search.pivot, looked_at)
     found = _Found(
         pose, confidence, rival, settled.clock, everything, calibration, breath_mm, bears_out,
         size, apart, contradicted, clocks, misplaced,
@@ -441,16 +442,27 @@ def _shows_heart(level: Level, pose: Float) -> Mask:
     return np.asarray(level.at(pose).in_view > LEAST_IN_VIEW)
 
 
+def _aside(
+    level: Level, pose: Float, sizes: Sequence[int], settings: RegisterSettings
+) -> tuple[int, ...]:
+    """Sweeps, counted from 1, that show bodies elsewhere while another shows the heart."""
+    return outvoted(level.samples.sweep(sizes), _shows_heart(level, pose), settings.min_frames)
+
+
+def _of_sweeps_of_the_heart(
+    level: Level, pose: Float, sizes: Sequence[int], settings: RegisterSettings
+) -> Level:
+    """Without the frames of sweeps that lie aside: beside the heart none has a time of its own."""
+    kept = ~np.isin(level.samples.sweep(sizes) + 1, _aside(level, pose, sizes, settings))
+    return level.only(np.flatnonzero(kept))
+
+
 def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
     level, settings = found.everything, search.settings
     shift_mm, turn_deg = (
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
     sweep, shows = level.samples.sweep(sizes), _shows_heart(level, found.pose)
-    aside, clocks = outvoted(sweep, shows, settings.min_frames), found.clocks
-    # Frames beside the heart have no time of their own.
-    if clocks is not None and {clocks.ahead, clocks.behind} & {*aside}:
-        clocks = None
     evidence = Evidence(
         confidence=found.confidence,
         rival=found.rival,
@@ -462,13 +474,13 @@ def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: f
         shift_mm=shift_mm,
         turn_deg=turn_deg,
         outvoted=outvoted(sweep[shows], found.bears_out[shows], settings.min_frames),
-        aside=aside,
+        aside=_aside(level, found.pose, sizes, settings),
         size=found.size,
         astray=longest_astray(sweep[shows], found.bears_out[shows]),
         elsewhere_mm=found.dissent.away_mm,
         apart=found.apart.gain,
         inspired=is_mostly_inspired(found.breath_mm),
-        clocks=clocks,
+        clocks=found.clocks,
         misplaced=found.misplaced,
     )
     return judge(evidence, settings)
