@@ -19,8 +19,8 @@ from typing import IO, Any, Protocol
 from pipeline.batch_ending import how_it_ended, old_products
 from pipeline.batch_plan import (
     LOGS,
-    TABLE,
     Plan,
+    Shard,
     notes_on,
     plan_batch,
     products_of,
@@ -68,6 +68,9 @@ class BatchWatcher(Protocol):
 class Batch:
     """How a batch ended."""
 
+    table: Path
+    """The file that holds the outcomes."""
+
     outcomes: list[Outcome]
     """By name; those of folders that are no study among them."""
 
@@ -76,7 +79,7 @@ class Batch:
 
     interrupted: bool
     unwritten: InputError | None
-    """Why ``batch.csv`` could not be written, if so."""
+    """Why the table could not be written, if so."""
 
 
 def run_batch(
@@ -85,11 +88,13 @@ def run_batch(
     workers: int,
     config: Path | None,
     watcher: BatchWatcher,
-    last: str | None = None,
+    last: str | None,
+    shard: Shard,
 ) -> Batch:
     """Run every study below ``studies``; write ``out/batch.csv`` after each.
 
-    Runs end after the stage ``last``, where one is given.
+    Runs end after the stage ``last``, where one is given. Of a ``shard`` only its part is run, and
+    told in a table of its own; other shards may be at work in ``out`` at the same time.
 
     A signal that ends programs begins no other study and is passed to those that run, which are
     waited for; SIGINT once more ends them at once.
@@ -98,17 +103,17 @@ def run_batch(
     ------
     InputError
         When there is nothing to run (see `plan_batch`), ``out`` cannot be written, or another batch
-        is at work in it.
+        (of a shard: another of the same part, or a whole one) is at work in it.
     """
     plans = plan_batch(studies, out)
-    with locked(out):
-        for orphan in out.glob(f".{TABLE}{PARTIAL}*"):
+    with locked(out, shard.name):
+        for orphan in out.glob(f".{shard.table}{PARTIAL}*"):
             remove(orphan)
         with readable_write_errors(out / LOGS):
             (out / LOGS).mkdir(exist_ok=True)
-        batch = _Running(out, config, last, watcher, plans)
+        batch = _Running(out, config, last, watcher, shard.part(plans), out / shard.table)
         batch.run(workers)
-        return batch.end(studies)
+        return batch.end(notes_on(studies, out, plans))
 
 
 class _Children:
@@ -180,8 +185,9 @@ class _Running:
         last: str | None,
         watcher: BatchWatcher,
         plans: Sequence[Plan],
+        table: Path,
     ) -> None:
-        self._out, self._watcher, self._plans = out, watcher, plans
+        self._out, self._watcher, self._plans, self._table = out, watcher, plans, table
         self._options = ["--out", str(out)]
         self._options += ["--config", str(config)] if config else []
         self._options += ["--until", last] if last else []
@@ -216,12 +222,11 @@ class _Running:
                 self._children.stop(signal.SIGTERM)
                 raise
 
-    def end(self, studies: Path) -> Batch:
-        """Write the whole table, and say what else is to be told."""
+    def end(self, notes: list[str]) -> Batch:
+        """Write the whole table."""
         outcomes = rows(self._ended)
-        unwritten = write_csv(self._out / TABLE, outcomes)
-        notes = notes_on(studies, self._out, self._plans)
-        return Batch(outcomes, notes, self._children.stopped, unwritten)
+        unwritten = write_csv(self._table, outcomes)
+        return Batch(self._table, outcomes, notes, self._children.stopped, unwritten)
 
     def _tell(self, one: Ended) -> None:
         self._ended.append(one)
@@ -233,7 +238,7 @@ class _Running:
 
     def _write(self) -> None:
         # What cannot be written now may be later; only the last time counts.
-        write_csv(self._out / TABLE, rows([*self._ended, *self._waiting.values()]))
+        write_csv(self._table, rows([*self._ended, *self._waiting.values()]))
 
     def _run_one(self, plan: Plan) -> Ended:
         try:

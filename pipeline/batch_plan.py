@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +13,53 @@ from pipeline.publish import read_record
 from pipeline.study import how_to_name_cine, is_study, open_study, studies_in
 from pipeline.study_files import cannot_be_entered, is_litter
 
-TABLE, LOGS = "batch.csv", "logs"
-"""What a batch itself writes beside the patients' folders."""
+LOGS = "logs"
+"""Where a batch writes beside the patients' folders, but for its table."""
+
+_TABLES = re.compile(r"batch(-\d+-of-\d+)?\.csv")
 
 MOST_NAMED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """One of several parts of a batch that run apart, on as many machines."""
+
+    number: int
+    """From 1."""
+
+    of: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read what a user writes: 2/4 is the second of four.
+
+        Raises
+        ------
+        InputError
+            When it is no such pair.
+        """
+        pair = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        number, of = map(int, pair.groups()) if pair else (0, 0)
+        if not 1 <= number <= of:
+            raise InputError(
+                f"--shard {text}: I/N is needed, I from 1 to N; 2/4 is the second of 4"
+            )
+        return cls(number, of)
+
+    @property
+    def name(self) -> str:
+        """What tells it from the others; empty of a batch that is whole."""
+        return f"{self.number}-of-{self.of}" if self.of > 1 else ""
+
+    @property
+    def table(self) -> str:
+        """The file in which its studies are told."""
+        return f"batch-{self.name}.csv" if self.name else "batch.csv"
+
+    def part(self, plans: Sequence[Plan]) -> Sequence[Plan]:
+        """Its share of all plans: every ``of``-th."""
+        return plans[self.number - 1 :: self.of]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +186,7 @@ def _without_clashes(plans: Sequence[Plan]) -> list[Plan]:
                 refused=f"{plan.folder}: has the patient id {plan.patient_id!r} of "
                 f"{_named(others)}; give each study its own patient_id in study.yaml",
             )
-        elif name in (TABLE, LOGS):
+        elif name == LOGS or _TABLES.fullmatch(name):
             plan = replace(
                 plan,
                 refused=f"{plan.folder}: a batch writes {name} of its own beside the patients; "

@@ -196,6 +196,7 @@ def batch(
     workers: Whole = 1,
     config: Config = None,
     until: str | None = None,
+    shard: str = "1/1",
 ) -> int:
     """Run a folder of studies, each in a process of its own; print and write a table of all.
 
@@ -210,24 +211,29 @@ def batch(
     until
         End each study's run after this stage: ingest, segment, surface, register, bake, evaluate or
         report.
+    shard
+        Run only a part, as one of several machines that write into one OUT: 2/4 is the second of
+        four, with a table of its own, OUT/batch-2-of-4.csv.
     """
     from pipeline.batch import run_batch
+    from pipeline.batch_plan import Shard
     from pipeline.batch_table import NO_STUDY, table
     from pipeline.config import read_settings
 
     if workers < 1:
         raise InputError(f"--workers {workers}: at least 1 is needed")
+    part = Shard.parse(shard)
     # What is wrong with the settings is wrong for every study, and is said once.
     read_settings(config)
 
-    ended = run_batch(studies, out, workers, config, BatchConsole(), _stage_name(until))
+    ended = run_batch(studies, out, workers, config, BatchConsole(), _stage_name(until), part)
     show(table(ended.outcomes))
     for note in ended.notes:
         show(f"note      {note}")
     show(f"products  {out}/<patient id>")
     if ended.unwritten:
         raise ended.unwritten
-    show(f"table     {out / 'batch.csv'}")
+    show(f"table     {ended.table}")
     if ended.interrupted:
         return INTERRUPTED_CODE
     return 0 if all(one.status in ("done", NO_STUDY) for one in ended.outcomes) else 1

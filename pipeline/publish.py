@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -195,26 +195,42 @@ def only_run_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, part: str = "") -> Iterator[None]:
     """Hold the folder's lock; the system lets go of it however the process ends.
+
+    Who does a named ``part`` of the work in a folder shares it with other parts, but neither with
+    who does all, nor with another of its own name.
 
     Raises
     ------
     InputError
-        When another run is at work in the folder, it cannot be written, or its name is no text.
+        When another run is at work in the folder, it cannot be written or locked, or its name is no
+        text.
     """
     require_text_name(folder.absolute())
     with readable_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("w")
-    with handle:
+    with ExitStack() as held:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+            _hold(held, folder / ".lock", fcntl.LOCK_SH if part else fcntl.LOCK_EX)
+            if part:
+                _hold(held, folder / f".lock-{part}", fcntl.LOCK_EX)
+        except BlockingIOError as error:
             raise InputError(
                 f"{folder}: another run is at work here; wait for it, or choose another --out"
             ) from error
+        except OSError as error:
+            raise InputError(
+                f"{folder}: its file system gives no locks ({error}); choose another --out"
+            ) from error
         yield
+
+
+def _hold(held: ExitStack, path: Path, how: int) -> None:
+    with readable_write_errors(path):
+        # Network file systems share a lock among those alone who may read.
+        handle = held.enter_context(path.open("a+"))
+    fcntl.flock(handle, how | fcntl.LOCK_NB)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -21,9 +21,9 @@ def stand_in(folder: Path, program: str) -> str:
     return str(wrapper)
 
 
-def rows_of(out: Path) -> dict[str, dict[str, str]]:
-    """Rows of ``batch.csv`` by the name of the patient's folder."""
-    with (out / "batch.csv").open(newline="", encoding="utf-8") as handle:
+def rows_of(out: Path, table: str = "batch.csv") -> dict[str, dict[str, str]]:
+    """Rows of the table by the name of the patient's folder."""
+    with (out / table).open(newline="", encoding="utf-8") as handle:
         return {row["patient"]: row for row in csv.DictReader(handle)}
 
 

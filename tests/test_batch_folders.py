@@ -60,8 +60,8 @@ def studies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "studies"
 
 
-def batch(studies: Path, out: Path | None = None) -> int:
-    return main(["batch", str(studies), "--out", str(out or studies.parent / "out")])
+def batch(studies: Path, out: Path | None = None, *more: str) -> int:
+    return main(["batch", str(studies), "--out", str(out or studies.parent / "out"), *more])
 
 
 def test_a_row_says_where_the_study_and_its_products_are(studies: Path) -> None:
@@ -103,7 +103,7 @@ def test_progress_counts_studies_whatever_else_is_refused_or_none(
     assert told == [(1, 2), (2, 2)]
 
 
-@pytest.mark.parametrize("name", ["logs", "batch.csv", "Logs"])
+@pytest.mark.parametrize("name", ["logs", "batch.csv", "Logs", "batch-2-of-4.csv"])
 def test_a_patient_is_not_called_what_the_batch_writes(studies: Path, name: str) -> None:
     make_study(studies / "bad", f"patient_id: {name}\n")
     assert batch(studies) == 1
@@ -296,6 +296,52 @@ def test_two_batches_do_not_share_a_folder(
     assert (out / "logs" / "good.log").read_text() == "of the first"
     assert not (out / "batch.csv").exists()
     assert batch(studies) == 0
+
+
+def test_shards_run_each_study_once_into_one_folder(
+    studies: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An id that two have is refused though they are in different shards."""
+    out = studies.parent / "out"
+    for name in ("a", "c", "d"):
+        make_study(studies / name)
+    (studies / "b").mkdir()
+    make_study(studies / "zz", "patient_id: a\n")
+    assert [batch(studies, None, "--shard", f"{one}/4") for one in (1, 2, 3, 4)] == [1, 1, 0, 0]
+    told = [rows_of(out, f"batch-{one}-of-4.csv") for one in (1, 2, 3, 4)]
+    assert [list(one) for one in told] == [["a", "good"], ["b", "zz"], ["c"], ["d"]]
+    assert [one["status"] for one in told[0].values()] == ["failed", "done"]
+    assert [one["status"] for one in told[1].values()] == ["no study", "failed"]
+    assert {one.parent.name for one in out.glob("*/run.json")} == {"good", "c", "d"}
+    assert not (out / "batch.csv").exists()
+    assert f"table     {out / 'batch-4-of-4.csv'}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("at_work", "begun", "code"),
+    [
+        ("1-of-2", ["--shard", "2/2"], 0),
+        ("1-of-2", ["--shard", "1/2"], 2),
+        ("1-of-2", [], 2),
+        ("", ["--shard", "1/2"], 2),
+    ],
+)
+def test_a_shard_works_beside_others_and_not_beside_itself_or_the_whole(
+    studies: Path, at_work: str, begun: list[str], code: int
+) -> None:
+    out = studies.parent / "out"
+    with locked(out, at_work):
+        assert batch(studies, None, *begun) == code
+    assert batch(studies, None, *begun) == 0
+
+
+@pytest.mark.parametrize("shard", ["0/4", "5/4", "1", "1/0", "-1/4", "1/4/4", "a/b", "1/", "²/4"])
+def test_what_names_no_shard_is_refused(
+    studies: Path, capsys: pytest.CaptureFixture[str], shard: str
+) -> None:
+    assert batch(studies, None, f"--shard={shard}") == 2
+    assert f"--shard {shard}: I/N is needed" in capsys.readouterr().err
+    assert not (studies.parent / "out").exists()
 
 
 def test_a_study_that_vanishes_while_it_runs_costs_nothing(studies: Path) -> None:
