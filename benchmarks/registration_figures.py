@@ -54,10 +54,10 @@ from pipeline.exact import ExactSurface, points_about
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
 from pipeline.imaging.cine import Cine
 from pipeline.products import read_cine
+from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.size import planes_of
 from pipeline.registration.space import find
-from pipeline.registration.uncertainty import motion_between
 
 FRAMES = "48,24,40,12,48,32,16"
 DROPOUT = (0.0, 0.2, 0.0, 0.4, 0.6)
@@ -154,9 +154,9 @@ def registered(
         "quantiles_mm": np.quantile(error, np.linspace(0, 1, 21)).tolist(),
         "expected_mm": found.expected_mm,
         "chance_under_2_mm": found.chance_under_2_mm,
-        "error": motion_between(
-            found.mr_from_tracker, study.mr_from_tracker, found.centre_mm
-        ).tolist(),
+        "error": Pivot(found.centre_mm, 1.0)
+        .step_between(study.mr_from_tracker, found.mr_from_tracker)
+        .tolist(),
         "covariance": found.covariance.tolist(),
         "confidence": found.confidence,
         "rival": found.rival,

@@ -17,23 +17,8 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from pipeline.batch_ending import how_it_ended, old_products
-from pipeline.batch_plan import (
-    LOGS,
-    Plan,
-    Shard,
-    notes_on,
-    plan_batch,
-    products_of,
-)
-from pipeline.batch_table import (
-    INTERRUPTED,
-    NO_STUDY,
-    WAITING,
-    Ended,
-    Outcome,
-    outcome_of,
-    rows,
-)
+from pipeline.batch_plan import LOGS, Plan, Shard, notes_on, plan_batch, products_of
+from pipeline.batch_table import INTERRUPTED, NO_STUDY, WAITING, Ended, Outcome, outcome_of, rows
 from pipeline.batch_table import write_table as write_csv
 from pipeline.errors import NOT_TO_BE_USED, InputError
 from pipeline.publish import (
@@ -200,7 +185,7 @@ class _Running:
         for plan in self._plans:
             if not plan.is_study:
                 why = "has neither cine/ nor study.yaml"
-                self._ended.append(outcome_of(plan.name, NO_STUDY, why, "", plan.folder))
+                self._ended.append(outcome_of(plan, NO_STUDY, why))
             elif plan.refused:
                 self._tell(self._not_done(plan, "failed", plan.refused))
         able = [plan for plan in self._plans if plan.is_study and not plan.refused]
@@ -274,8 +259,7 @@ class _Running:
             cause = f"{lost}/run.json: cannot be read though the run ended well; run it again"
             return self._not_done(plan, "failed", cause, seconds, before)
         # After --until, what lies behind may be of other settings.
-        ended = plan.name, status, old_products(products, True), plan.patient_id, plan.folder
-        return outcome_of(*ended, seconds, record, products)
+        return outcome_of(plan, status, old_products(products, True), seconds, record, products)
 
     def _not_begun(self, plan: Plan, status: str = INTERRUPTED) -> Ended:
         """A study that nothing is known to be done about; its products may well hold."""
@@ -286,7 +270,7 @@ class _Running:
         shown = (
             products if read_record(products).get("study") == str(plan.folder.resolve()) else None
         )
-        return outcome_of(plan.name, status, cause, plan.patient_id, plan.folder, products=shown)
+        return outcome_of(plan, status, cause, products=shown)
 
     def _not_done(
         self,
@@ -304,8 +288,7 @@ class _Running:
             cause = "; ".join(filter(None, (cause, old_products(products, came_to_a_stage))))
         shown = products if record.get("study") == str(plan.folder.resolve()) else None
         of_this_run = record if shown and came_to_a_stage else None
-        ended = plan.name, status, cause, plan.patient_id, plan.folder
-        return outcome_of(*ended, seconds, of_this_run, shown)
+        return outcome_of(plan, status, cause, seconds, of_this_run, shown)
 
 
 def _log_name(patient: str) -> str:

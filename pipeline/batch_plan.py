@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.publish import read_record
+from pipeline.publish import patients_in, standing_products
 from pipeline.study import how_to_name_cine, is_study, open_study, studies_in
 from pipeline.study_files import cannot_be_entered, is_litter
 
@@ -180,19 +180,18 @@ def _without_clashes(plans: Sequence[Plan]) -> list[Plan]:
         name = plan.patient_id.casefold()
         same = [one for one in plans if name and one.patient_id.casefold() == name]
         others = [str(one.folder) for one in same if one is not plan]
+        refused = plan.refused
         if others:
-            plan = replace(
-                plan,
-                refused=f"{plan.folder}: has the patient id {plan.patient_id!r} of "
-                f"{_named(others)}; give each study its own patient_id in study.yaml",
+            refused = (
+                f"{plan.folder}: has the patient id {plan.patient_id!r} of {_named(others)}; give "
+                "each study its own patient_id in study.yaml"
             )
         elif name == LOGS or _TABLES.fullmatch(name):
-            plan = replace(
-                plan,
-                refused=f"{plan.folder}: a batch writes {name} of its own beside the patients; "
-                f"give a patient_id other than {plan.patient_id!r} in study.yaml",
+            refused = (
+                f"{plan.folder}: a batch writes {name} of its own beside the patients; give a "
+                f"patient_id other than {plan.patient_id!r} in study.yaml"
             )
-        checked.append(plan)
+        checked.append(replace(plan, refused=refused))
     return checked
 
 
@@ -206,7 +205,7 @@ def notes_on(studies: Path, out: Path, plans: Sequence[Plan]) -> list[str]:
     loose = [one.name for one in beside if not one.is_symlink() and not is_litter(one.name)]
     known = {one.patient_id or one.name for one in plans if one.is_study}
     known |= {products.name for one in plans if (products := products_of(out, one))}
-    others = [one.name for one in _patients(out) if one.name not in known]
+    others = [one.name for one in patients_in(out) if one.name not in known]
     told = (
         (loose, f"{studies}: files beside the studies were not looked at"),
         (others, f"{out}: also holds products that are of no study of this batch"),
@@ -227,12 +226,4 @@ def products_of(out: Path, plan: Plan) -> Path | None:
     if plan.patient_id:
         known = out / plan.patient_id
         return known if known.is_dir() else None
-    return next((one for one in _patients(out) if _is_of(one, plan.folder)), None)
-
-
-def _patients(out: Path) -> Iterable[Path]:
-    return sorted(path.parent for path in out.glob("*/run.json"))
-
-
-def _is_of(products: Path, study: Path) -> bool:
-    return read_record(products).get("study") == str(study.resolve())
+    return next(iter(standing_products(plan.folder, out)), None)

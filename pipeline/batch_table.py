@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.batch_plan import Plan
 from pipeline.console import in_one_line, plain
 from pipeline.errors import InputError
 from pipeline.publish import write_whole
@@ -19,7 +20,6 @@ NO_STUDY = "no study"
 
 INTERRUPTED = "interrupted"
 """Status of a study that was told to end, or that was not begun."""
-
 
 WAITING = "not ended"
 """Status of a study of a batch that is at work, or was killed."""
@@ -73,11 +73,9 @@ class Ended:
 
 
 def outcome_of(
-    patient: str,
+    plan: Plan,
     status: str,
     cause: str,
-    patient_id: str,
-    study: Path,
     seconds: float = 0.0,
     record: Mapping[str, Any] | None = None,
     products: Path | None = None,
@@ -93,15 +91,15 @@ def outcome_of(
         if stage.get("status") != "stale"
     }
     outcome = Outcome(
-        patient=patient,
+        patient=plan.name,
         status=status,
         seconds=round(seconds, 1),
         **_figures(stages),
         registration=_verdict(stages.get("register", {})),
         remarks=_remarks(stages) if status == "done" else "",
         cause=cause,
-        patient_id=patient_id,
-        study=str(study),
+        patient_id=plan.patient_id,
+        study=str(plan.folder),
         products=str(products or ""),
     )
     return Ended(outcome, _images(record or {}))

@@ -56,7 +56,7 @@ Config = Annotated[Path | None, Parameter(help="YAML file of settings; defaults 
 
 def _run(
     study: Path, out: Path, config: Path | None, first: str | None = None, last: str | None = None
-) -> dict[str, Any]:
+) -> None:
     from pipeline.config import read_settings
     from pipeline.publish import standing_products
     from pipeline.run import run_study
@@ -68,7 +68,8 @@ def _run(
         for products in standing_products(_meant(study), out):
             error.add_note(f"{products} holds products of another run; {NOT_TO_BE_USED}")
         raise
-    return run_study(opened, settings, out, Console(), first, last)
+    record = run_study(opened, settings, out, Console(), first, last)
+    show(summary(record, out / record["patient_id"]))
 
 
 def _meant(folder: Path) -> Path:
@@ -123,8 +124,7 @@ def run(
     """
     first, last = _stage_name(from_), _stage_name(until)
     _require_order(first, last)
-    record = _run(study, out, config, first, last)
-    show(summary(record, out / record["patient_id"]))
+    _run(study, out, config, first, last)
     return 0
 
 
@@ -132,8 +132,7 @@ def _stage_command(name: str, help_text: str) -> None:
     def command(
         study: Annotated[Path, Parameter(help=STUDY)], /, *, out: Out, config: Config = None
     ) -> int:
-        record = _run(study, out, config, last=name)
-        show(summary(record, out / record["patient_id"]))
+        _run(study, out, config, last=name)
         return 0
 
     command.__doc__ = help_text + ", bringing the stages before it up to date."
@@ -173,8 +172,7 @@ def bake(
     if (study is None) == (surfaces is None):
         raise InputError("bake needs either a STUDY or --surfaces FOLDER")
     if study is not None:
-        record = _run(study, out, config, last="bake")
-        show(summary(record, out / record["patient_id"]))
+        _run(study, out, config, last="bake")
         return 0
     assert surfaces is not None
     from pipeline.config import read_settings
@@ -398,9 +396,7 @@ def rpeaks(record: Path, /, *, out: Path) -> int:
 
 
 @app.command(help_flags=(), version_flags=())
-def synth(
-    *arguments: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)],
-) -> int:
+def synth(*arguments: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)]) -> int:
     """Make synthetic patient studies: beatfield synth OUT [--seed N] [--preview] ...
 
     `beatfield synth --help` lists all options.

@@ -6,7 +6,6 @@ A message says where, what came, what was needed and what to do.
 NOT_TO_BE_USED = "do not use them for this one"
 """Ends a note on products of another run; by these words a batch knows that it was told."""
 
-
 INTERRUPTED_CODE = 130
 """Exit code of a program that was told to end, as shells have it."""
 

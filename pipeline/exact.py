@@ -13,22 +13,13 @@ class ExactSurface:
     """A closed surface that answers one point after another, exactly and slowly."""
 
     def __init__(self, surface: Surface) -> None:
-        from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-        from vtkmodules.vtkCommonCore import vtkPoints
-        from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+        import pyvista
         from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
 
-        places, cells = vtkPoints(), vtkCellArray()
-        places.SetData(numpy_to_vtk(np.ascontiguousarray(surface.vertices_mm), deep=1))
-        offsets = np.arange(0, 3 * len(surface.triangles) + 1, 3)
-        connectivity = np.ascontiguousarray(surface.triangles.ravel())
-        cells.SetData(
-            numpy_to_vtkIdTypeArray(offsets, deep=1), numpy_to_vtkIdTypeArray(connectivity, deep=1)
-        )
-        mesh = vtkPolyData()
-        mesh.SetPoints(places)
-        mesh.SetPolys(cells)
         self._implicit: Any = vtkImplicitPolyDataDistance()
+        mesh = pyvista.PolyData.from_regular_faces(
+            surface.vertices_mm, surface.triangles, deep=True
+        )
         self._implicit.SetInput(mesh)
 
     def distance_mm(self, points_mm: Float) -> Float:

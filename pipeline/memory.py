@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 CLEAR_REFS = Path("/proc/self/clear_refs")
@@ -20,11 +21,9 @@ class PeakMemory:
     """
 
     def __init__(self) -> None:
-        try:
+        self._resettable = False
+        with suppress(OSError):
             CLEAR_REFS.write_text("5")
-        except OSError:
-            self._resettable = False
-        else:
             self._resettable = True
 
     def megabytes(self) -> float:

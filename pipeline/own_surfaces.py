@@ -34,10 +34,7 @@ ones: single precision, in which files may hold them, does less by far."""
 
 
 def bake_own_surfaces(
-    folder: Path,
-    out: Path,
-    settings: Settings,
-    progress: Progress | None = None,
+    folder: Path, out: Path, settings: Settings, progress: Progress | None = None
 ) -> Path:
     """Bake the surfaces in a folder into ``out/field.zarr``, whole or not at all; return it.
 
@@ -189,10 +186,7 @@ def measure_field(path: Path, folder: Path, progress: Progress | None = None) ->
     }
     done = itertools.count(1)
     accuracy = certify(
-        field,
-        surfaces,
-        settings.samples,
-        lambda: progress(next(done), count) if progress else None,
+        field, surfaces, settings.samples, lambda: progress(next(done), count) if progress else None
     )
     said, found = (
         max(float(one.get(key, 0)) for key in ("node_error_near_mm", "node_error_far_mm"))
@@ -211,11 +205,10 @@ def _baked_with(field: ForceField) -> BakeSettings:
     """How a field is to be measured: as its source says, or by default where that says nothing
     that this version knows."""
     said = field.source.get("bake")
-    known = (
-        {name: said.get(name) for name in ("samples", "bounds")} if isinstance(said, dict) else {}
-    )
+    told = said if isinstance(said, dict) else {}
+    known = {name: told[name] for name in ("samples", "bounds") if told.get(name) is not None}
     try:
-        return BakeSettings.model_validate({k: one for k, one in known.items() if one is not None})
+        return BakeSettings.model_validate(known)
     except ValidationError:
         return BakeSettings()
 

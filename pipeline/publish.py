@@ -274,8 +274,12 @@ def standing_products(study: Path, out: Path) -> list[Path]:
     """The folders in ``out`` with products of a study that may no longer be understood: their
     ``run.json`` names its folder."""
     folder = str(study.resolve())
-    found = sorted(path.parent for path in out.glob("*/run.json"))
-    return [products for products in found if read_record(products).get("study") == folder]
+    return [one for one in patients_in(out) if read_record(one).get("study") == folder]
+
+
+def patients_in(out: Path) -> list[Path]:
+    """The folders in ``out`` that a run wrote in, by name."""
+    return sorted(path.parent for path in out.glob("*/run.json"))
 
 
 def stale_words(field: Path) -> str:

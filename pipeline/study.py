@@ -329,14 +329,15 @@ def _require_files(study: Study) -> None:
             f"{study.cine.path}: is empty; it needs the cine's DICOM files, or a 4D NIfTI file"
         )
     _require_what_fits_the_cine(study)
-    for stem in (study.ecg.mr, study.ecg.us):
-        if stem is not None and not record_files(stem):
+    for stem in filter(None, (study.ecg.mr, study.ecg.us)):
+        files = record_files(stem)
+        if not files:
             raise InputError(
                 f"{study.folder}: no ECG record {stem}, which study.yaml names; add its .hea and "
                 "data, .csv or .dcm, name the right one, or write null there"
             )
-        for header in record_files(stem):
-            if stem and header.suffix == ".hea" and header.stem == stem.stem:
+        for header in files:
+            if header.suffix == ".hea" and header.stem == stem.stem:
                 require_signals(header)
     if study.us and study.ecg.us is None:
         beside = sorted(one.relative_to(study.folder).as_posix() for one in

@@ -148,9 +148,8 @@ def _files_by_structure(folder: Path) -> dict[str, list[Path]]:
         raise InputError(f"{folder}: no such folder; give one that holds closed surfaces")
     found: dict[str, dict[int, Path]] = {}
     for path in sorted([*folder.iterdir(), *folder.glob("*/*")]):
-        if path.suffix.lower() not in MESH_ENDINGS or not path.is_file():
-            continue
-        if path.name.startswith("."):
+        hidden = path.name.startswith(".")
+        if hidden or path.suffix.lower() not in MESH_ENDINGS or not path.is_file():
             continue
         structure, number = _place(folder, path)
         phases = found.setdefault(structure, {})

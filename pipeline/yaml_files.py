@@ -12,7 +12,6 @@ from pipeline.errors import InputError
 MOST_NODES = 100_000
 """Keys and values in a file; aliases of aliases grow a few lines beyond all memory."""
 
-
 NO_VALUE = (ValueError, KeyError, IndexError, AttributeError, TypeError)
 """What the library raises of values that are none, such as 2024-13-01 or !!bool maybe."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from batch_program import rows_of, stand_in
 
+from pipeline.batch_plan import Plan
 from pipeline.batch_table import outcome_of, rows
 from pipeline.cli import main
 from pipeline.errors import NOT_TO_BE_USED as OLD
@@ -159,11 +160,11 @@ def test_a_folder_that_is_no_study_is_listed_and_costs_nothing(
 def test_ultrasound_that_was_not_registered_is_told_from_none(cause: str, verdict: str) -> None:
     """`on_failure: mr_frame`: the study is done, its registration is not."""
     record = {"stages": {"register": {"status": "skipped", "cause": cause}}}
-    outcome = outcome_of("a", "done", "", "a", Path("a"), record=record).outcome
+    outcome = outcome_of(Plan("a", Path("a"), "a"), "done", "", record=record).outcome
     assert outcome.registration == verdict
     assert outcome.remarks == (f"not registered: {cause}" if verdict else "")
 
 
 def test_studies_of_which_no_images_are_known_are_not_called_the_same() -> None:
-    ended = [outcome_of(name, "failed", "no cine", "", Path(name)) for name in "ab"]
+    ended = [outcome_of(Plan(name, Path(name)), "failed", "no cine") for name in "ab"]
     assert [one.remarks for one in rows(ended)] == ["", ""]

@@ -315,7 +315,7 @@ def test_clocks_that_are_apart_make_a_result_doubtful(long_recording, surfaces):
 
 def test_clocks_far_apart_are_compared_round_the_beat(monkeypatch):
     """Offsets of nearly half a beat ahead and behind lie side by side."""
-    samples = type("Samples", (), {"sweep": lambda _, sizes: np.repeat([0, 1, 2], sizes)})()
+    samples = type("Samples", (), {"sweep": np.repeat([0, 1, 2], 24)})()
     own_level = type("Own", (int,), {"thinned": lambda one, _: one})
     level = type("Level", (), {"samples": samples, "only": lambda _, some: own_level(some[0])})()
     own = {0: (0.38, 0.005), 24: (-0.39, 0.005), 48: (-0.30, 0.005)}

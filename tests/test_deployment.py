@@ -17,6 +17,7 @@ from data_synth.errors import SynthError
 from data_synth.settings import PhantomSettings
 from data_synth.study import write_study
 from pipeline import caches, compiled
+from pipeline.batch_plan import Plan
 from pipeline.batch_table import outcome_of, write_table
 from pipeline.console import BatchConsole, Console, plain, show
 from pipeline.ending import guarded
@@ -125,7 +126,7 @@ def test_a_batch_says_how_long_it_will_take(
     now_s = iter((0.0, 120.0, 480.0, 500.0))
     monkeypatch.setattr("pipeline.console.time.monotonic", lambda: next(now_s))
     told = BatchConsole()
-    outcome = outcome_of("anna", "done", "", "p-1", Path("/studies/anna")).outcome
+    outcome = outcome_of(Plan("anna", Path("/studies/anna"), "p-1"), "done", "").outcome
     for done in (1, 4, 5):
         told.ended(outcome, done, 5)
     one, four, five = capsys.readouterr().err.splitlines()
@@ -181,7 +182,7 @@ def test_files_are_read_and_written_alike_whatever_letters_the_system_knows(tmp_
 
 @pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@SUM(A1)"])
 def test_a_spreadsheet_runs_no_folders_name(tmp_path: Path, name: str) -> None:
-    outcome = outcome_of(name, "failed", "=cause", "p-1", Path("/studies") / name).outcome
+    outcome = outcome_of(Plan(name, Path("/studies") / name, "p-1"), "failed", "=cause").outcome
     assert write_table(tmp_path / "batch.csv", [outcome]) is None
     with (tmp_path / "batch.csv").open(newline="") as handle:
         [row] = csv.DictReader(handle)

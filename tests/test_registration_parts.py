@@ -139,8 +139,7 @@ def gain_of(recording, motion):
     search = prepare_search(recording.phases, moving_surfaces(), None, settings)
     level = search.fine_level(sweeps)
     pose = climb(level, recording.mr_from_tracker, search.pivot)
-    sweep = level.samples.sweep([len(one.images) for one in sweeps])
-    return parts_apart(level, pose, search.pivot, sweep).gain
+    return parts_apart(level, pose, search.pivot, level.samples.sweep).gain
 
 
 def shifted(x_mm):
@@ -213,7 +212,7 @@ def test_frames_that_contradict_with_one_voice_leave_the_pose_open(seen):
     )
     search = prepare_search(recording.phases, moving_surfaces(), None, settings)
     level = search.fine_level(sweeps)
-    first = level.samples.sweep([24, 24]) == 0
+    first = level.samples.sweep == 0
     pose = recording.mr_from_tracker
     found = dissent(search, sweeps, level, pose, 1 - first.astype(int), first, ~first)
     if seen == "noise":

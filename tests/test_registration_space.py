@@ -33,10 +33,10 @@ from pipeline.products import FrameRow, read_frames, write_frames
 from pipeline.registration import space
 from pipeline.registration.clock_offset import Timing
 from pipeline.registration.in_view import require_heart_in_view
+from pipeline.registration.pose_search import Pivot
 from pipeline.registration.search import Search
 from pipeline.registration.settings import RegisterSettings
 from pipeline.registration.space import find, register
-from pipeline.registration.uncertainty import motion_between
 from pipeline.stages import register as stage
 from pipeline.study import UltrasoundFiles
 
@@ -105,7 +105,8 @@ class TestRegister:
         found = register(
             recording.sweeps, recording.phases, surfaces, start_off(recording, 5, 10, 10), QUICK
         )
-        off = motion_between(found.mr_from_tracker, recording.mr_from_tracker, found.centre_mm)
+        pivot = Pivot(found.centre_mm, lever_mm=1.0)
+        off = pivot.step_between(recording.mr_from_tracker, found.mr_from_tracker)
         assert off @ np.linalg.solve(found.covariance, off) < 22.5
         np.testing.assert_allclose(found.covariance, found.covariance.T)
         # The floor alone: the relative curvatures of six directions sum to 6, those of the three

@@ -17,7 +17,6 @@ from pipeline.geometry import transform_points
 from pipeline.registration import space
 from pipeline.registration.clock_offset import ClocksApart
 from pipeline.registration.dissent import NONE, longest_astray, outvoted
-from pipeline.registration.frames import Samples
 from pipeline.registration.parts import Apart
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.settings import RegisterSettings
@@ -30,7 +29,6 @@ from pipeline.registration.uncertainty import (
     floor_of,
     in_radians,
     long_run,
-    motion_between,
     rising,
     sandwich,
     slopes_at,
@@ -212,12 +210,11 @@ def in_millimetres(covariance):
     return covariance * np.outer(scale, scale)
 
 
-def test_motion_between_poses_is_the_step_that_was_made():
+def test_step_between_poses_is_the_one_that_was_made():
     step = np.array([1.0, -2.0, 0.5, 3.0, 1.0, -2.0])
     pose = np.eye(4)
     pose[:3, 3] = 5, 6, 7
-    motion = motion_between(PIVOT.move(pose, step), pose, PIVOT.centre_mm)
-    np.testing.assert_allclose(motion, step / np.repeat([1, PIVOT.lever_mm], 3), atol=1e-12)
+    np.testing.assert_allclose(PIVOT.step_between(pose, PIVOT.move(pose, step)), step, atol=1e-12)
     there = transform_points(PIVOT.move(np.eye(4), step), PIVOT.centre_mm)
     np.testing.assert_allclose(there - PIVOT.centre_mm, step[:3], atol=1e-12)
 
@@ -332,40 +329,40 @@ class TestVerdict:
 
     def test_sweeps_of_a_registration_are_compared(self):
         borne_out = np.arange(40) < 20
-        none = np.zeros(0, np.float32)
-        begins = np.zeros(41, np.int64)
-        samples = Samples(none, none, none, begins[:-1], begins, np.zeros(40), np.arange(40))
+        one, two = np.zeros(40, int), np.repeat([0, 1], 20)
         same = Apart(0.0, np.zeros((6, 6)))
         alone = {"dissent": NONE, "breath_mm": np.zeros(40)}
         sure = {"confidence": 2.0, "rival": 0.1, "size": AS_IT_IS, "apart": same, "misplaced": ""}
-        in_view = np.ones(40)
-        level = SimpleNamespace(samples=samples, at=lambda _: SimpleNamespace(in_view=in_view))
-        found = SimpleNamespace(
-            everything=level, bears_out=borne_out, pose=None, clocks=None, **sure, **alone
-        )
         search = SimpleNamespace(settings=RegisterSettings(), start=None, pivot=None)
-        verdict = space._verdict(found, search, (20, 20), 1.0)
+
+        def judged(sweep, shows):
+            level = SimpleNamespace(samples=SimpleNamespace(sweep=sweep))
+            aside = outvoted(sweep, shows, least=10)
+            seen = {"shows": shows, "aside": aside, "bears_out": borne_out, "clocks": None}
+            found = SimpleNamespace(level=level, pose=None, **seen, **sure, **alone)
+            return space._verdict(found, search, 1.0)
+
+        verdict = judged(two, np.ones(40, bool))
         assert verdict.grade == "doubtful"
         assert "frames of sweep 2 bear out" in verdict.reason
-        verdict = space._verdict(found, search, (40,), 1.0)
+        verdict = judged(one, np.ones(40, bool))
         assert verdict.grade == "doubtful"
         assert "20 frames in a row of sweep 1" in verdict.reason
         # A sweep that leaves the heart speaks for itself; one that hardly meets it, for a tracker
         # that was moved between them, or for poses in another unit.
-        in_view[~borne_out] = 0
-        assert space._verdict(found, search, (40,), 1.0).grade == "good"
-        verdict = space._verdict(found, search, (20, 20), 1.0)
+        assert judged(one, borne_out).grade == "good"
+        verdict = judged(two, borne_out)
         assert verdict.grade == "doubtful"
         assert "few frames of sweep 2 show the heart" in verdict.reason
-        # Its frames have no time of their own, by which its clock could be told.
-        level.only = list
-        told = space._of_sweeps_of_the_heart(level, None, (20, 20), search.settings)
-        assert told == list(range(20))
-        in_view[20:26] = 1
-        verdict = space._verdict(found, search, (20, 20), 1.0)
+        verdict = judged(two, np.arange(40) < 26)
         assert "few frames of sweep 2 show the heart" not in verdict.reason
-        told = space._of_sweeps_of_the_heart(level, None, (20, 20), search.settings)
-        assert told == list(range(40))
+
+    def test_frames_of_a_sweep_beside_the_heart_tell_no_clock(self):
+        """They have no time of their own."""
+        samples = SimpleNamespace(sweep=np.repeat([0, 1], 20))
+        level = SimpleNamespace(samples=samples, only=list)
+        assert space._of_sweeps_of_the_heart(level, (2,)) == list(range(20))
+        assert space._of_sweeps_of_the_heart(level, ()) == list(range(40))
 
     def test_frames_that_agree_best_as_they_came_are_not_said_to_agree_better_otherwise(self):
         weak = SOUND | {"confidence": 1.1, "shift_mm": 31.0, "misplaced": "mirrored"}

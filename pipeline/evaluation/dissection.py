@@ -175,12 +175,7 @@ def guidance(structure: str, device: DeviceName) -> Fixture:
     if device == "touch":
         return Fixture(structure=structure, kind="guidance", delta_mm=3.1, m=1, f_max_n=2.0)
     return Fixture(
-        structure=structure,
-        kind="guidance",
-        gamma_mm=1.5,
-        m=2,
-        f_max_n=6.0,
-        device=DEVICES[device],
+        structure=structure, kind="guidance", gamma_mm=1.5, m=2, f_max_n=6.0, device=DEVICES[device]
     )
 
 

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csgraph
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Surface, area_vectors, transform_points
 from pipeline.surface.measures import distances_mm
+from pipeline.surface.mesh import adjacency
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,10 +168,7 @@ def phase_error(found: Float, truth: Float) -> Float:
 def closedness(surface: Surface) -> Closedness:
     """Count what keeps a mesh from being the outward boundary of one solid."""
     vertices, triangles = surface.vertices_mm, surface.triangles
-    count = len(vertices)
-    rows, columns = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    _, part = csgraph.connected_components(graph, directed=False)
+    _, part = connected_components(adjacency(triangles, len(vertices)), directed=False)
     used = np.unique(part[triangles[:, 0]])
     a, b, c = (vertices[triangles[:, k]] - vertices.mean(axis=0) for k in range(3))
     volume = np.bincount(part[triangles[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)

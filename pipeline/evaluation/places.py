@@ -53,11 +53,7 @@ def settle(
 
 
 def on_surface(
-    field: ForceField,
-    structure: str,
-    count: int,
-    seed: int,
-    towards: Float | None = None,
+    field: ForceField, structure: str, count: int, seed: int, towards: Float | None = None
 ) -> tuple[Float, Float]:
     """Places of a baked surface, at the R peak, from which one can leave it in a straight line.
 

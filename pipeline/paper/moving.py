@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from io import BytesIO
 from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+
+from pipeline.report.style import as_moving_webp
 
 
 def animated(figures: Iterable[Figure], seconds: float, dots_per_inch: int) -> bytes:
@@ -20,14 +21,4 @@ def animated(figures: Iterable[Figure], seconds: float, dots_per_inch: int) -> b
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    buffer = BytesIO()
-    images[0].save(
-        buffer,
-        format="WEBP",
-        save_all=True,
-        append_images=images[1:],
-        duration=max(round(1000 * seconds / len(images)), 20),
-        loop=0,
-        quality=75,
-    )
-    return buffer.getvalue()
+    return as_moving_webp(images, max(round(1000 * seconds / len(images)), 20), quality=75)

@@ -64,12 +64,19 @@ def force_errors(
     late_s
         By how much the clock is behind.
     """
+    ways = np.random.default_rng([seed, 2]).standard_normal((PLACES, 3))
+    ways *= shift_mm / np.linalg.norm(ways, axis=1, keepdims=True)
+    return _errors(field, fixture, seed, ways, late_s)
+
+
+def _errors(
+    field: ForceField, fixture: str, seed: int, shift_mm: Float, late_s: float | Float
+) -> Float:
+    """As `force_errors`, of tools that seem to be by ``(3,)`` or ``(n, 3)`` elsewhere."""
     assert field.rr_s is not None
     points, phases = near_places(field, field.fixtures[fixture].structure, seed)
-    ways = np.random.default_rng([seed, 2]).standard_normal(points.shape)
-    ways *= shift_mm / np.linalg.norm(ways, axis=1, keepdims=True)
     right = field.force_n(points, phases, fixture)
-    wrong = field.force_n(points + ways, phases - late_s / field.rr_s, fixture)
+    wrong = field.force_n(points + shift_mm, phases - late_s / field.rr_s, fixture)
     return np.asarray(np.linalg.norm(wrong - right, axis=1))
 
 
@@ -138,10 +145,7 @@ def _lost_ecg(axis: Axes, field: ForceField, seed: int) -> None:
     def errors(name: str, n: int) -> Float:
         off = np.random.default_rng([seed, 3]).standard_normal(PLACES)
         late_s = off * RR_SPREAD * rr_s * np.sqrt(x[n] / rr_s)
-        points, phases = near_places(field, field.fixtures[name].structure, seed)
-        right = field.force_n(points, phases, name)
-        wrong = field.force_n(points, phases - late_s / rr_s, name)
-        return np.asarray(np.linalg.norm(wrong - right, axis=1))
+        return _errors(field, name, seed, np.zeros(3), late_s)
 
     _curves(axis, field, x, errors)
     axis.set(xlabel="seconds since the ECG was lost", title="no ECG")
@@ -153,11 +157,8 @@ def _lost_ultrasound(axis: Axes, field: ForceField, seed: int) -> None:
 
     def errors(name: str, n: int) -> Float:
         down_mm = BREATH_MM * (1 - np.cos(2 * np.pi * x[n] / BREATH_S)) / 2
-        points, phases = near_places(field, field.fixtures[name].structure, seed)
-        right = field.force_n(points, phases, name)
         # The tool seems to be where it would be if the heart had stayed: LPS, head up.
-        wrong = field.force_n(points - down_mm * UP, phases, name)
-        return np.asarray(np.linalg.norm(wrong - right, axis=1))
+        return _errors(field, name, seed, -down_mm * UP, 0.0)
 
     _curves(axis, field, x, errors)
     axis.set(xlabel="seconds since the ultrasound was lost", title="no ultrasound, free breathing")

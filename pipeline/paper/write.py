@@ -118,17 +118,8 @@ class Part:
     """A finished experiment under its name."""
 
     name: str
+    experiment: Experiment
     section: Section
-    command: str
-
-
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """A row of the comparison."""
-
-    what: str
-    paper: str
-    here: str
     command: str
 
 
@@ -165,7 +156,7 @@ def write_paper(out: Path, options: PaperOptions, watcher: Watcher) -> Path:
             continue
         watcher.started(name)
         section = experiment.make(subject, options.seed, options.operators, watcher.progress)
-        parts.append(Part(name, section, f"{options.command()} --only {name}"))
+        parts.append(Part(name, experiment, section, f"{options.command()} --only {name}"))
     with publishing(out) as folder:
         (folder / MARK).write_text("written by beatfield paper\n")
         (folder / "index.html").write_text(
@@ -206,13 +197,8 @@ def _lacking(experiment: Experiment, subject: Subject) -> str | None:
 
 def render(subject: Subject, parts: Sequence[Part], notes: Sequence[str]) -> str:
     """The page as HTML; text is escaped."""
-    beside = [
-        Beside(one.what, one.paper, one.here, part.command)
-        for part in parts
-        for one in (EXPERIMENTS[part.name],)
-    ]
     source, folder = str(subject.field_path), Path(__file__).parent
-    return filled(folder, source=source, notes=notes, beside=beside, parts=parts)
+    return filled(folder, source=source, notes=notes, parts=parts)
 
 
 def _write_files(folder: Path, part: Part) -> None:

@@ -58,9 +58,6 @@ class Calibration:
     tracker_from_picture: Float
     """``(frames, 4, 4)`` of all frames of the study, as calibrated."""
 
-    sweep: Integer
-    """``(frames,)`` number of each frame's sweep."""
-
     steps_mm: Float
     """``(sweeps, 6)`` corrections: shift, then rotation vector times the pivot's lever."""
 
@@ -73,7 +70,7 @@ class Calibration:
         """The level, of frames as calibrated, with each where its correction puts it."""
         samples = level.samples
         planes = self.tracker_from_picture[samples.number]
-        motions = planes @ self._motions()[self.sweep[samples.number]] @ np.linalg.inv(planes)
+        motions = planes @ self._motions()[samples.sweep] @ np.linalg.inv(planes)
         points_mm = np.empty_like(samples.points_mm)
         for motion, first, end in zip(motions, samples.first, samples.first[1:], strict=False):
             points_mm[first:end] = samples.points_mm[first:end] @ motion[:3, :3].T + motion[:3, 3]
@@ -90,7 +87,7 @@ class Calibration:
         numbers = level.samples.number
         mr_from_picture = mr_from_tracker @ self.tracker_from_picture[numbers]
         turned = mr_from_picture[:, :3, :3]
-        shift_mm = self.steps_mm[self.sweep[numbers], :3, None]
+        shift_mm = self.steps_mm[level.samples.sweep, :3, None]
         # A correction turns about where it has shifted the origin to; the pose about the pivot.
         origin_mm = (turned @ shift_mm)[..., 0] + mr_from_picture[:, :3, 3]
         arm = (origin_mm - self.pivot.centre_mm) / self.pivot.lever_mm
@@ -148,9 +145,8 @@ def calibration_of(
     level
         Samples of the sweeps' frames: the middle of a sector is that of what is looked at.
     """
-    sizes = [len(sweep.images) for sweep in sweeps]
-    sweep_of = np.repeat(np.arange(len(sweeps)), sizes)
-    origins = [_origin_px(sweep, level, sweep_of == k) for k, sweep in enumerate(sweeps)]
+    begins = np.cumsum([0, *(len(sweep.images) for sweep in sweeps)])
+    origins = [_origin_px(sweep, level, k, begins[k]) for k, sweep in enumerate(sweeps)]
     planes = [
         tracker_from_picture(sweep.tracker_from_image, origin)
         for sweep, origin in zip(sweeps, origins, strict=True)
@@ -160,21 +156,21 @@ def calibration_of(
         names=tuple(sweep.name for sweep in sweeps),
         origins_px=np.array(origins),
         tracker_from_picture=np.concatenate(planes),
-        sweep=sweep_of,
         steps_mm=np.zeros((len(sweeps), 6)),
         belief_mm=np.repeat([settings.calibration_sd_mm, turn_mm], 3),
         pivot=pivot,
     )
 
 
-def _origin_px(sweep: TrackedSweep, level: Level, mine: Mask) -> Integer:
-    """The pixel in the middle of what is looked at in a sweep's frames."""
+def _origin_px(sweep: TrackedSweep, level: Level, number: int, begin: int) -> Integer:
+    """The pixel in the middle of what is looked at in a sweep's frames, the first of which is frame
+    ``begin`` of the study."""
     samples = level.samples
-    seen = np.flatnonzero(mine[samples.number])
+    seen = np.flatnonzero(samples.sweep == number)
     if len(seen) == 0:
         return np.array(sweep.images.shape[:0:-1], dtype=np.int64) // 2
     points_mm = samples.points_mm[samples.first[seen[0]] : samples.first[seen[0] + 1]]
-    pose = sweep.tracker_from_image[samples.number[seen[0]] - np.flatnonzero(mine)[0]]
+    pose = sweep.tracker_from_image[samples.number[seen[0]] - begin]
     middle = np.linalg.lstsq(pose[:3, :2], points_mm.mean(axis=0) - pose[:3, 3], rcond=None)[0]
     return np.asarray(middle.round(), dtype=np.int64)
 
@@ -286,7 +282,7 @@ def _expansion(
     derivatives of a frame's loss are those of all. How the lifts change with the correction
     counts for nothing where slopes cancel, as they do at the optimum.
     """
-    sweep, sweeps = calibration.sweep[placed.samples.number], len(calibration.names)
+    sweep, sweeps = placed.samples.sweep, len(calibration.names)
     worth = _worth(Curvature(slopes, rising(bending.sum(axis=0))), sweep, error_mm)
     lifts = calibration.lifts(placed, pose)
     slope, of_frames = np.zeros((1 + sweeps, 6)), np.zeros((6 + 6 * sweeps, 6 + 6 * sweeps))

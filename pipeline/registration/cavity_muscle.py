@@ -87,13 +87,13 @@ class CineOnGrid:
         """``(slice, row, column)``: share of each voxel, from that of the grid's nodes."""
         return _mean_at(self.grid_from_voxel, share).reshape(self.intensity.shape[1:])
 
-    def grey_of_muscle(self, index: int, heart: Float32, blood: Float32) -> float | None:
-        """Median grey in phase number ``index`` where there is heart and no blood; None where no
-        voxel is all muscle."""
+    def grey_of_muscle(self, heart: Float32, blood: Float32) -> float | None:
+        """Median grey in the first phase where there is heart and no blood; None where too few
+        voxels are all muscle."""
         muscle = (self.in_voxels(heart) > _ALL) & (self.in_voxels(blood) < _NONE)
         if muscle.sum() < _LEAST_VOXELS:
             return None
-        return float(np.median(self.intensity[index][muscle]))
+        return float(np.median(self.intensity[0][muscle]))
 
     def muscle_inside(
         self, index: int, blood: Float32, ventricles: Float32, grey_of_muscle: float

@@ -239,7 +239,7 @@ def clocks_apart(
     """
     if timing is None or timing.doubts():
         return None
-    sweep = level.samples.sweep([len(times_s) for times_s in timing.times_s])
+    sweep = level.samples.sweep
     told: dict[int, tuple[float, float]] = {}
     for number in np.unique(sweep).tolist():
         # Each sweep by itself, or of many none would have frames enough.
@@ -336,6 +336,6 @@ class _Profile:
 
     def _spread(self, slopes: Float) -> float:
         """Variance of the sum of the frames' slopes; neighbours of one sweep err together."""
-        sweep = self.level.samples.sweep([len(times_s) for times_s in self.timing.times_s])
         away = slopes - slopes.mean()
-        return max(float(long_run(away[:, None], sweep, REACH)[0, 0]), float(away @ away))
+        together = long_run(away[:, None], self.level.samples.sweep, REACH)[0, 0]
+        return max(float(together), float(away @ away))

@@ -102,14 +102,13 @@ class Samples:
     number: Integer
     """``(frames,)``: place of the frame in the study, counted through all sweeps."""
 
+    sweep: Integer
+    """``(frames,)``: number of the frame's sweep, counted from 0."""
+
     @property
     def frames(self) -> int:
         """How many frames there are."""
         return len(self.phases)
-
-    def sweep(self, sizes: Sequence[int]) -> Integer:
-        """``(frames,)`` number of each frame's sweep, of sweeps of so many frames each."""
-        return np.searchsorted(np.cumsum(sizes), self.number, side="right")
 
 
 def sample_frames(
@@ -140,10 +139,11 @@ def sample_frames(
     """
     parts: list[Samples] = []
     offset = 0
-    for sweep, own in zip(sweeps, phases, strict=True):
+    for place, (sweep, own) in enumerate(zip(sweeps, phases, strict=True)):
         _require_sweep(sweep, own)
-        part = _sample_sweep(sweep, own, spacing_mm, smoothing_mm, trend_mm)
-        parts.append(replace(part, number=part.number + offset))
+        lattice = lattice_of(sweep, spacing_mm, smoothing_mm, trend_mm)
+        part = sample_pictures(lattice, sweep.images, sweep.tracker_from_image, own)
+        parts.append(replace(part, number=part.number + offset, sweep=part.sweep + place))
         offset += len(own)
     if not any(part.frames for part in parts):
         raise UnregistrableError(
@@ -167,6 +167,7 @@ def choose(samples: Samples, frames: Integer) -> Samples:
         first,
         samples.phases[frames],
         samples.number[frames],
+        samples.sweep[frames],
     )
 
 
@@ -193,15 +194,6 @@ def _require_sweep(sweep: TrackedSweep, phases: Float) -> None:
         raise InputError(
             f"{sweep.name}: needs {count} phases in [0, 1), one a frame, got {phases.shape}"
         )
-
-
-def _sample_sweep(
-    sweep: TrackedSweep, phases: Float, spacing_mm: float, smoothing_mm: float, trend_mm: float
-) -> Samples:
-    """Samples of one sweep; its frames share the pixels that are looked at."""
-    lattice = lattice_of(sweep, spacing_mm, smoothing_mm, trend_mm)
-    usable = np.asarray(np.isfinite(sweep.tracker_from_image).all(axis=(1, 2)))
-    return sample_pictures(lattice, sweep.images, sweep.tracker_from_image, phases, usable)
 
 
 def lattice_of(
@@ -241,9 +233,10 @@ def _places_in(
 
 
 def sample_pictures(
-    lattice: Lattice, images: Float32, tracker_from_image: Float, phases: Float, usable: Mask
+    lattice: Lattice, images: Float32, tracker_from_image: Float, phases: Float
 ) -> Samples:
-    """Samples of the usable pictures ``(n, h, w)`` at poses ``(n, 4, 4)`` that show a body.
+    """Samples of the pictures ``(n, h, w)`` that show a body at a known pose ``(n, 4, 4)``, as of
+    one sweep.
 
     A sample's grey value is its rank among the frame's: whatever the scanner's curve from echo to
     grey, a few glaring mirrors count for no more than their number. Blood counts as it is, and is
@@ -252,24 +245,27 @@ def sample_pictures(
     seen = (lattice.smoothing @ images.reshape(len(images), -1).T).T
     # A flat picture (a dead frame) has rounding errors for contrast.
     lively = seen.std(axis=1) > 1e-3 * max(lattice.brightest, 1e-30)
+    usable = lively & np.isfinite(tracker_from_image).all(axis=(1, 2))
     if lattice.contact is None:
-        kept = np.flatnonzero(usable & lively)
+        kept = np.flatnonzero(usable)
         bright = 1 - seen[kept]
     else:
-        kept = np.flatnonzero(usable & lively & lattice.contact.touching(images))
+        kept = np.flatnonzero(usable & lattice.contact.touching(images))
         bright = rankdata(seen[kept], axis=1) / len(lattice.at)
     grey = bright - (bright @ lattice.trend) @ lattice.trend.T
     spread = np.maximum(grey.std(axis=1), 1e-9)
     pixels = np.column_stack([lattice.at, np.zeros(len(lattice.at)), np.ones(len(lattice.at))])
     points = np.einsum("fij,sj->fsi", tracker_from_image[kept, :3], pixels)
+    first = np.zeros(len(kept), dtype=np.int64)
     return Samples(
         points.reshape(-1, 3).astype(np.float32),
         (grey / spread[:, None]).reshape(-1).astype(np.float32),
         lattice.trend.astype(np.float32),
-        np.zeros(len(kept), dtype=np.int64),
+        first,
         np.arange(len(kept) + 1) * len(lattice.at),
         phases[kept],
         kept,
+        first,
     )
 
 
@@ -373,4 +369,5 @@ def _join(parts: Sequence[Samples]) -> Samples:
         np.concatenate([[0], np.cumsum(counts)]),
         np.concatenate([part.phases for part in parts]),
         np.concatenate([part.number for part in parts]),
+        np.concatenate([part.sweep for part in parts]),
     )

@@ -20,18 +20,11 @@ import numpy as np
 from pipeline.errors import InputError
 from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.imaging.cine import Cine
-from pipeline.registration.frames import (
-    Lattice,
-    Samples,
-    TrackedSweep,
-    lattice_of,
-    sample_pictures,
-)
+from pipeline.registration.frames import Lattice, Samples, TrackedSweep, lattice_of, sample_pictures
 from pipeline.registration.pose_search import Pivot
 from pipeline.registration.reading import Reader, as_compared
-from pipeline.registration.search import prepare_search
+from pipeline.registration.search import Level, prepare_search
 from pipeline.registration.settings import RegisterSettings
-from pipeline.registration.similarity import agreement, expansion
 from pipeline.registration.space import Registration
 from pipeline.registration.tissue_map import TissueMap
 from pipeline.registration.uncertainty import STEP_MM, curvature_at, rising, sandwich
@@ -130,8 +123,7 @@ class Eye:
         images, transforms = image[None], tracker_from_image[None]
         if self.reader is not None:
             images, transforms = self.reader.read(images), self.reader.placed(transforms)
-        usable = np.asarray(np.isfinite(transforms).all(axis=(1, 2)))
-        return sample_pictures(self.lattice, images, transforms, np.array([phase]), usable)
+        return sample_pictures(self.lattice, images, transforms, np.array([phase]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,12 +150,7 @@ class Follower:
     about each axis at the pivot's lever."""
 
     def follow(
-        self,
-        state: LiveState,
-        eye: Eye,
-        image: Float32,
-        tracker_from_image: Float,
-        phase: float,
+        self, state: LiveState, eye: Eye, image: Float32, tracker_from_image: Float, phase: float
     ) -> Drift:
         """Refine the state by one frame.
 
@@ -195,11 +182,12 @@ class Follower:
         samples = eye.sample(image, tracker_from_image, phase)
         if samples.frames == 0:
             return self._left(state, waited)
-        explained = float(agreement(samples, self.tissue, state.mr_from_tracker).explained[0])
+        level = Level(samples, self.tissue)
+        explained = float(level.at(state.mr_from_tracker).explained[0])
         if not explained > _ODD_SHARE * state.usual:
             return self._left(replace(state, astray=state.astray + 1, agreed=0), waited)
         usual = state.usual + _FOLLOWED * (explained - state.usual)
-        step, covariance = self._update(samples, state.mr_from_tracker, waited)
+        step, covariance = self._update(level, state.mr_from_tracker, waited)
         pose = self.pivot.move(state.mr_from_tracker, step)
         agreed = state.agreed + 1 if state.lost else 0
         lost = 0 < agreed < LOST_AFTER
@@ -217,12 +205,12 @@ class Follower:
         """After a frame that told nothing."""
         return self._drift(replace(state, covariance_mm2=waited + self.shared_mm2), used=False)
 
-    def _update(self, samples: Samples, pose: Float, prior_mm2: Float) -> tuple[Float, Float]:
+    def _update(self, level: Level, pose: Float, prior_mm2: Float) -> tuple[Float, Float]:
         """Step and covariance after one frame's loss, expanded about the present pose."""
 
         def slopes(step_mm: Float) -> Float:
-            moved, arm = self.pivot.move(pose, step_mm), (self.pivot.centre_mm, self.pivot.lever_mm)
-            return np.asarray(expansion(samples, self.tissue, moved, *arm).slopes[0])
+            moved = self.pivot.move(pose, step_mm)
+            return np.asarray(level.expansion(moved, self.pivot).slopes[0])
 
         # How the slopes change is a third of the work of how the losses do, to second order.
         steps = STEP_MM * np.eye(6)
@@ -269,13 +257,8 @@ def prepare_follower(
     level = search.fine_level(compared)
     good = np.flatnonzero(registered.valid[level.samples.number])
     level = level.only(good).thinned(settings.max_frames)
-
-    def losses(step_mm: Float) -> Float:
-        return level.losses(search.pivot.move(pose, step_mm))
-
-    curvature = curvature_at(losses)
-    sweep = level.samples.sweep([len(one.images) for one in sweeps])
-    spread = sandwich(curvature, sweep)
+    curvature = curvature_at(lambda step_mm: level.losses(search.pivot.move(pose, step_mm)))
+    spread = sandwich(curvature, level.samples.sweep)
     scale = np.repeat([1.0, search.pivot.lever_mm], 3)
     covariance_mm2 = registered.covariance * np.outer(scale, scale)
     shared_mm2 = rising(covariance_mm2 - spread)

@@ -15,23 +15,25 @@ from pipeline.registration.search import Search
 
 def mirrored(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with left and right exchanged: the same pictures and sector, no anatomy."""
-    columns = np.flatnonzero(sector_of(sweep).any(axis=0))
-    swap = np.eye(4)
-    swap[0, 0], swap[0, 3] = -1, columns[0] + columns[-1]
-    return _displaced(sweep, "mirrored", sweep.images, sweep.tracker_from_image @ swap)
+    return _turned_over(sweep, "mirrored", 0)
 
 
 def upside_down(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with near and far exchanged."""
-    rows = np.flatnonzero(sector_of(sweep).any(axis=1))
-    swap = np.eye(4)
-    swap[1, 1], swap[1, 3] = -1, rows[0] + rows[-1]
-    return _displaced(sweep, "upside down", sweep.images, sweep.tracker_from_image @ swap)
+    return _turned_over(sweep, "upside down", 1)
 
 
 def backwards(sweep: TrackedSweep) -> TrackedSweep:
     """The sweep with its pictures in reverse order: each at the pose and phase of another."""
     return _displaced(sweep, "backwards", sweep.images[::-1], sweep.tracker_from_image)
+
+
+def _turned_over(sweep: TrackedSweep, how: str, axis: int) -> TrackedSweep:
+    """With the sector's columns (axis 0) or rows (1) in the opposite order."""
+    shown = np.flatnonzero(sector_of(sweep).any(axis=axis))
+    swap = np.eye(4)
+    swap[axis, axis], swap[axis, 3] = -1, shown[0] + shown[-1]
+    return _displaced(sweep, how, sweep.images, sweep.tracker_from_image @ swap)
 
 
 def _displaced(

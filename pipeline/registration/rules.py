@@ -163,8 +163,7 @@ def _t_wave_until_s(overdue: bool, plan: Plan, s: State) -> float:
 def _are_wide(s: State) -> bool:
     """Whether the usual beat is as wide as where a bundle branch is blocked: its T wave is late."""
     ratio, weights = 0.0, 0.0
-    for k in range(len(s.leads)):
-        lead = s.leads[k]
+    for lead in s.leads:
         if lead.weight > 0.0 and lead.usual.tall > 0.0:
             ratio += lead.weight * lead.usual.steep / lead.usual.tall
             weights += lead.weight
@@ -230,8 +229,7 @@ def _is_wide(since_s: float, height: float, plan: Plan, s: State) -> bool:
 def _came_before(s: State) -> bool:
     """Whether the wave measured last looks like the wide wave before it, which it now replaces."""
     likeness, weights = 0.0, 0.0
-    for k in range(len(s.leads)):
-        lead = s.leads[k]
+    for lead in s.leads:
         if lead.weight > 0.0:
             likeness += lead.weight * (lead.here.shape * lead.wide).sum()
             weights += lead.weight

@@ -17,12 +17,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float, Mask, MovingSurface, require_rigid
 from pipeline.imaging.cine import Cine
 from pipeline.progress import Progress
-from pipeline.registration.breathing import (
-    AXIS,
-    follow_breath,
-    is_mostly_inspired,
-    rest_error_mm,
-)
+from pipeline.registration.breathing import AXIS, follow_breath, is_mostly_inspired, rest_error_mm
 from pipeline.registration.calibration import Calibration, calibrate, calibration_of, certainty
 from pipeline.registration.clock_offset import (
     ClockOffset,
@@ -52,13 +47,7 @@ from pipeline.registration.uncertainty import (
     in_radians,
     sandwich,
 )
-from pipeline.registration.verdict import (
-    APART,
-    Evidence,
-    Grade,
-    Verdict,
-    judge,
-)
+from pipeline.registration.verdict import APART, Evidence, Grade, Verdict, judge
 
 # A frame that the model explains less than this share of the usual shows something else.
 _LEAST_OF_USUAL = 0.25
@@ -144,15 +133,24 @@ class _Found:
     """A pose, and what it was found with."""
 
     pose: Float
+    level: Level
+    """All frames."""
+
+    shows: Mask
+    bears_out: Mask
+    breath_mm: Float
+    """Of the frames of ``level``, as whether they show the heart, and bear the pose out."""
+
+    judged: Level
+    """The frames that found the pose."""
+
+    aside: tuple[int, ...]
+    """Sweeps, counted from 1, that show bodies elsewhere while another shows the heart."""
+
     confidence: float
     rival: float
     clock: ClockOffset | None
-    everything: Level
     calibration: Calibration | None
-    breath_mm: Float
-    bears_out: Mask
-    """Of the frames of ``everything``, as those of ``breath_mm``."""
-
     size: Size
     apart: Apart
     dissent: Dissent
@@ -238,10 +236,9 @@ def find(
     ends = [] if cine is None else open_ends(surfaces, cine)
     open_above = [lid.atrium for lid in open_lids(surfaces, ends)]
     cut = sorted({name for end in ends for name in end.chambers}, key=BLOOD.index)
-    if lacking or cut:
-        further = _LACKING * len(lacking) + _CUT * len(cut)
-        wider_mm = settings.model_error_mm * (1 + further)
-        settings = settings.model_copy(update={"model_error_mm": wider_mm})
+    further = _LACKING * len(lacking) + _CUT * len(cut)
+    wider_mm = settings.model_error_mm * (1 + further)
+    settings = settings.model_copy(update={"model_error_mm": wider_mm})
     search = prepare_search(phases, surfaces, start, settings, cine)
     compared = as_compared(sweeps, settings)
     tell(1, _STEPS)
@@ -252,28 +249,28 @@ def find(
     tell(2, _STEPS)
     chance, misplaced = by_chance(search, best.pose, compared)
     tell(3, _STEPS)
-    everything = search.fine_level(compared)
-    sizes = [len(sweep.images) for sweep in sweeps]
-    pose = _refined(everything, best.pose, search)
-    everything, pose, calibration = _calibrated(everything, pose, search, sweeps)
-    everything, pose, breath_mm = _breathing(everything, pose, search, sizes)
+    level, pose, calibration, breath_mm = _placed(search, best.pose, compared, sweeps)
     tell(4, _STEPS)
     tiny = np.finfo(float).tiny
     confidence, rival = best.score / max(chance, tiny), best.rival / max(best.score, tiny)
-    bears_out = _bears_out(everything, pose, search.pivot)
-    judged = _judged(everything, bears_out, settings)
-    size = fitting_size(judged, pose, search.pivot, planes_of(cine))
-    apart = _apart(everything, pose, search.pivot, sizes)
-    contradicted = _dissent(search, compared, everything, pose, bears_out, sizes)
+    pivot, sweep, least = search.pivot, level.samples.sweep, settings.min_frames
+    shows = np.asarray(level.at(pose).in_view > LEAST_IN_VIEW)
+    bears_out = _bears_out(level, pose, pivot)
+    judged = _judged(level, bears_out, settings)
+    size = fitting_size(judged, pose, pivot, planes_of(cine))
+    shown = level.only(np.flatnonzero(shows))
+    apart = parts_apart(shown, pose, pivot, shown.samples.sweep)
+    against = contradicting(sweep, shows, bears_out, least)
+    contradicted = dissent(search, compared, level, pose, sweep, bears_out, against)
+    aside = outvoted(sweep, shows, least)
     looked_at = timing if settings.clock_offset != "ignore" else None
-    of_heart = _of_sweeps_of_the_heart(everything, pose, sizes, settings)
-    clocks = clocks_apart(of_heart, pose, search.pivot, looked_at)
+    clocks = clocks_apart(_of_sweeps_of_the_heart(level, aside), pose, pivot, looked_at)
     found = _Found(
-        pose, confidence, rival, settled.clock, everything, calibration, breath_mm, bears_out,
-        size, apart, contradicted, clocks, misplaced,
+        pose, level, shows, bears_out, breath_mm, judged, aside, confidence, rival, settled.clock,
+        calibration, size, apart, contradicted, clocks, misplaced,
     )  # fmt: skip
     heart_mm = np.concatenate([_some(s.vertices_mm[0]) for s in cavities_of(surfaces)])
-    result = _doubted(_summarise(found, search, sizes, heart_mm), doubts)
+    result = _doubted(_summarise(found, search, phases, heart_mm), doubts)
     tell(_STEPS, _STEPS)
     return _naming_what_is_unknown(result, lacking, open_above, cut)
 
@@ -300,6 +297,17 @@ def _naming_what_is_unknown(
         said = f"the images end inside {', '.join(cut)}: what lies beyond is not known"
         result = replace(result, reason=f"{result.reason}; {said}")
     return result
+
+
+def _placed(
+    search: Search, pose: Float, compared: Sequence[TrackedSweep], sweeps: Sequence[TrackedSweep]
+) -> tuple[Level, Float, Calibration | None, Float]:
+    """All frames and the pose that they find; the calibration and the breath that place them."""
+    level = search.fine_level(compared)
+    pose = _refined(level, pose, search)
+    level, pose, calibration = _calibrated(level, pose, search, sweeps)
+    level, pose, breath_mm = _breathing(level, pose, search)
+    return level, pose, calibration, breath_mm
 
 
 def _refined(everything: Level, pose: Float, search: Search) -> Float:
@@ -349,25 +357,20 @@ def _calibrated(
     return found.placed(level), pose, found
 
 
-def _breathing(
-    level: Level, pose: Float, search: Search, sizes: Sequence[int]
-) -> tuple[Level, Float, Float]:
+def _breathing(level: Level, pose: Float, search: Search) -> tuple[Level, Float, Float]:
     """Frames, pose and each frame's displacement along the breathing axis, if breath was free."""
     if search.settings.breath == "hold":
         return level, pose, np.zeros(level.samples.frames)
-    sweep = level.samples.sweep(sizes)
-    placed, pose, breath_mm = follow_breath(level, pose, search.pivot, sweep)
+    placed, pose, breath_mm = follow_breath(level, pose, search.pivot, level.samples.sweep)
     return placed, _refined(placed, pose, search), breath_mm
 
 
-def _covariance(
-    found: _Found, search: Search, sizes: Sequence[int]
-) -> tuple[Float, tuple[Correction, ...]]:
+def _covariance(found: _Found, search: Search) -> tuple[Float, tuple[Correction, ...]]:
     """Covariance of the pose, mm and rad, from the frames that found it, with the model's floor
     and what corrections of calibrations leave open; and these corrections."""
-    judged = _judged(found.everything, found.bears_out, search.settings)
+    judged = found.judged
     curvature = curvature_at(lambda step: judged.losses(search.pivot.move(found.pose, step)))
-    spread = in_radians(sandwich(curvature, judged.samples.sweep(sizes)), search.pivot)
+    spread = in_radians(sandwich(curvature, judged.samples.sweep), search.pivot)
     floor = floor_of(search.settings.model_error_mm, curvature.bending, search.pivot)
     floor += in_radians(found.size.error_mm**2 * np.eye(6), search.pivot)
     if found.apart.gain > APART:
@@ -381,33 +384,32 @@ def _covariance(
 
 
 def _summarise(
-    found: _Found, search: Search, sizes: Sequence[int], heart_mm: Float
+    found: _Found, search: Search, phases: Sequence[Float], heart_mm: Float
 ) -> Registration:
     """Judge every frame of the study, and the pose itself."""
-    level, pose, pivot = found.everything, found.pose, search.pivot
-    frames = sum(sizes)
-    covariance, corrections = _covariance(found, search, sizes)
-    expected = expected_tre_mm(covariance, pivot.centre_mm, heart_mm)
-    verdict = _verdict(found, search, sizes, float(np.sqrt((expected**2).mean())))
-    judged = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
-    residual = np.ones(frames)
-    residual[level.samples.number] = 1 - level.at(pose).explained
-    valid = np.zeros(frames, dtype=bool)
-    valid[level.samples.number] = found.bears_out
-    breath_mm = np.zeros(frames)
-    breath_mm[level.samples.number] = found.breath_mm
+    level, pose, centre_mm = found.level, found.pose, search.pivot.centre_mm
+    covariance, corrections = _covariance(found, search)
+    each_mm = expected_tre_mm(covariance, centre_mm, heart_mm)
+    expected_mm = float(np.sqrt((each_mm**2).mean()))
+    verdict = _verdict(found, search, expected_mm)
+    valued = level.only(np.flatnonzero(found.bears_out)) if found.bears_out.any() else level
+    frames, number = sum(map(len, phases)), level.samples.number
+    residual, valid, breath_mm = np.ones(frames), np.zeros(frames, dtype=bool), np.zeros(frames)
+    residual[number] = 1 - level.at(pose).explained
+    valid[number] = found.bears_out
+    breath_mm[number] = found.breath_mm
     return Registration(
         mr_from_tracker=pose,
         residual=residual,
         valid=valid,
-        score=judged.score(pose),
-        start_score=0.0 if search.start is None else judged.score(search.start),
+        score=valued.score(pose),
+        start_score=0.0 if search.start is None else valued.score(search.start),
         confidence=found.confidence,
         rival=found.rival,
         covariance=covariance,
-        centre_mm=pivot.centre_mm,
-        expected_mm=float(np.sqrt((expected**2).mean())),
-        chance_under_2_mm=chance_below(covariance, pivot.centre_mm, heart_mm, 2.0),
+        centre_mm=centre_mm,
+        expected_mm=expected_mm,
+        chance_under_2_mm=chance_below(covariance, centre_mm, heart_mm, 2.0),
         breath_mm=breath_mm,
         corrections=corrections,
         verdict=verdict.grade,
@@ -418,69 +420,34 @@ def _summarise(
     )
 
 
-def _apart(level: Level, pose: Float, pivot: Pivot, sizes: Sequence[int]) -> Apart:
-    """How parts of the recording, of frames that show the heart, differ."""
-    shows = level.only(np.flatnonzero(_shows_heart(level, pose)))
-    return parts_apart(shows, pose, pivot, shows.samples.sweep(sizes))
-
-
-def _dissent(
-    search: Search,
-    sweeps: Sequence[TrackedSweep],
-    level: Level,
-    pose: Float,
-    bears_out: Mask,
-    sizes: Sequence[int],
-) -> Dissent:
-    """What the frames agree on that contradict the pose."""
-    sweep, least = level.samples.sweep(sizes), search.settings.min_frames
-    against = contradicting(sweep, _shows_heart(level, pose), bears_out, least)
-    return dissent(search, sweeps, level, pose, sweep, bears_out, against)
-
-
-def _shows_heart(level: Level, pose: Float) -> Mask:
-    return np.asarray(level.at(pose).in_view > LEAST_IN_VIEW)
-
-
-def _aside(
-    level: Level, pose: Float, sizes: Sequence[int], settings: RegisterSettings
-) -> tuple[int, ...]:
-    """Sweeps, counted from 1, that show bodies elsewhere while another shows the heart."""
-    return outvoted(level.samples.sweep(sizes), _shows_heart(level, pose), settings.min_frames)
-
-
-def _of_sweeps_of_the_heart(
-    level: Level, pose: Float, sizes: Sequence[int], settings: RegisterSettings
-) -> Level:
+def _of_sweeps_of_the_heart(level: Level, aside: Sequence[int]) -> Level:
     """Without the frames of sweeps that lie aside: beside the heart none has a time of its own."""
-    kept = ~np.isin(level.samples.sweep(sizes) + 1, _aside(level, pose, sizes, settings))
-    return level.only(np.flatnonzero(kept))
+    return level.only(np.flatnonzero(~np.isin(level.samples.sweep + 1, aside)))
 
 
-def _verdict(found: _Found, search: Search, sizes: Sequence[int], expected_mm: float) -> Verdict:
-    level, settings = found.everything, search.settings
+def _verdict(found: _Found, search: Search, expected_mm: float) -> Verdict:
     shift_mm, turn_deg = (
         (0.0, 0.0) if search.start is None else search.pivot.distance(found.pose, search.start)
     )
-    sweep, shows = level.samples.sweep(sizes), _shows_heart(level, found.pose)
+    # A frame that shows no body, or not the heart, speaks neither for a result nor against it; a
+    # sweep that shows bodies and not the heart is no sweep of this heart.
+    sweep, bears_out = found.level.samples.sweep[found.shows], found.bears_out[found.shows]
     evidence = Evidence(
         confidence=found.confidence,
         rival=found.rival,
         expected_mm=expected_mm,
         valid=int(found.bears_out.sum()),
-        # A frame that shows no body, or not the heart, speaks neither for a result nor against it;
-        # a sweep that shows bodies and not the heart is no sweep of this heart.
-        frames=int(shows.sum()),
+        frames=int(found.shows.sum()),
         shift_mm=shift_mm,
         turn_deg=turn_deg,
-        outvoted=outvoted(sweep[shows], found.bears_out[shows], settings.min_frames),
-        aside=_aside(level, found.pose, sizes, settings),
+        outvoted=outvoted(sweep, bears_out, search.settings.min_frames),
+        aside=found.aside,
         size=found.size,
-        astray=longest_astray(sweep[shows], found.bears_out[shows]),
+        astray=longest_astray(sweep, bears_out),
         elsewhere_mm=found.dissent.away_mm,
         apart=found.apart.gain,
         inspired=is_mostly_inspired(found.breath_mm),
         clocks=found.clocks,
         misplaced=found.misplaced,
     )
-    return judge(evidence, settings)
+    return judge(evidence, search.settings)

@@ -141,7 +141,7 @@ def _grey_of_muscle(
     if "epicardium" not in surfaces or not any(name in VENTRICLES for name in names):
         return None
     blood = np.minimum(sum(coverage(surfaces[name].at(0), grid) for name in names), 1)
-    return seen.grey_of_muscle(0, coverage(surfaces["epicardium"].at(0), grid), blood)
+    return seen.grey_of_muscle(coverage(surfaces["epicardium"].at(0), grid), blood)
 
 
 def cavities_of(surfaces: Mapping[str, MovingSurface]) -> list[MovingSurface]:

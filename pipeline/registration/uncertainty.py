@@ -17,9 +17,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from pipeline.geometry import Float, Integer, transform_points
+from pipeline.geometry import Float, Integer
 from pipeline.registration.pose_search import Pivot
 
 FrameLosses = Callable[[Float], Float]
@@ -193,11 +192,3 @@ def chance_below(covariance: Float, centre_mm: Float, points_mm: Float, limit_mm
     for one in arm:
         total += np.linalg.norm(error[:, :3] + np.cross(error[:, 3:], one), axis=1)
     return float((total < limit_mm * len(arm)).mean())
-
-
-def motion_between(pose: Float, other: Float, centre_mm: Float) -> Float:
-    """``(6,)`` shift (mm) and rotation vector (rad) about ``centre_mm`` from ``other`` to
-    ``pose``: what a covariance is about."""
-    motion = pose @ np.linalg.inv(other)
-    shift = transform_points(motion, centre_mm) - centre_mm
-    return np.concatenate([shift, Rotation.from_matrix(motion[:3, :3]).as_rotvec()])

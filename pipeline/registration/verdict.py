@@ -12,7 +12,6 @@ from pipeline.registration.size import AS_IT_IS, Size
 
 Grade = Literal["good", "doubtful", "failed"]
 
-
 APART = 0.06
 """By what share of the score parts of a recording may agree better with poses of their own: those
 of 60 in 61 studies that were right did by 0.042 at most, and by more than 0.06 in 63 of 66 whose
@@ -107,12 +106,8 @@ def judge(evidence: Evidence, settings: RegisterSettings) -> Verdict:
     it out, it ended outside the range that was searched, or its expected error is beyond use. It
     is good where its expected error is small, most frames bear it out and none of that is near.
     """
-    failures, of_size = _failures(evidence, settings), _doubts_of_size(evidence.size)
-    of_parts = [
-        *_doubts_of_dissent(evidence),
-        *_doubts_of_place(evidence.aside),
-        *_doubts_of_parts(evidence.apart),
-    ]
+    failures = _failures(evidence, settings)
+    of_size, of_parts = _doubts_of_size(evidence.size), _doubts_of_parts(evidence)
     if failures and evidence.confidence < 1:
         # Where frames fit better in the wrong place, a size that fits better there says nothing.
         return Verdict("failed", "; ".join(failures))
@@ -210,47 +205,42 @@ def _doubts(evidence: Evidence, settings: RegisterSettings) -> list[str]:
     return reasons
 
 
-def _doubts_of_dissent(evidence: Evidence) -> list[str]:
+def _doubts_of_parts(evidence: Evidence) -> list[str]:
+    """What sweeps, and parts of them, have against each other."""
+    reasons = []
     in_a_row, number = evidence.astray
     away = ""
     if evidence.elsewhere_mm > 0:
         away = f", and agree on a place {evidence.elsewhere_mm:.0f} mm away"
     if evidence.outvoted:
         named = ", ".join(map(str, evidence.outvoted))
-        return [
+        reasons.append(
             f"few frames of sweep {named} bear out what the others do{away}: where it shows the "
             "heart, one of them lies beside its place, by more than is expected here: look at "
             "calibration (were pictures cropped?), pixel size and whether the patient or the "
             "tracker was moved between them"
-        ]
-    if in_a_row >= IN_A_ROW:
-        return [
+        )
+    elif in_a_row >= IN_A_ROW:
+        reasons.append(
             f"{in_a_row} frames in a row of sweep {number} show the heart and do not bear out what "
             f"the others do{away}: was the patient, the tracker or the reference moved meanwhile, "
             "or the depth changed? Cut them off, or record the sweep again"
-        ]
-    return []
-
-
-def _doubts_of_place(aside: tuple[int, ...]) -> list[str]:
-    if not aside:
-        return []
-    return [
-        f"few frames of sweep {', '.join(map(str, aside))} show the heart where another sweep "
-        "places it: look at the unit of its poses (mm), its calibration and whether the patient or "
-        "the tracker was moved between them; leave it out if it is of something else"
-    ]
-
-
-def _doubts_of_parts(apart: float) -> list[str]:
-    if not apart > APART:
-        return []
-    return [
-        f"parts of the recording agree {apart:.0%} better with poses of their own: was the "
-        "patient, the tracker or the reference moved meanwhile, was the breath not held "
-        "(register.breath), is the calibration or the pixel size off, or do images lag behind the "
-        "tracker's poses?"
-    ]
+        )
+    if evidence.aside:
+        named = ", ".join(map(str, evidence.aside))
+        reasons.append(
+            f"few frames of sweep {named} show the heart where another sweep places it: look at "
+            "the unit of its poses (mm), its calibration and whether the patient or the tracker "
+            "was moved between them; leave it out if it is of something else"
+        )
+    if evidence.apart > APART:
+        reasons.append(
+            f"parts of the recording agree {evidence.apart:.0%} better with poses of their own: "
+            "was the patient, the tracker or the reference moved meanwhile, was the breath not "
+            "held (register.breath), is the calibration or the pixel size off, or do images lag "
+            "behind the tracker's poses?"
+        )
+    return reasons
 
 
 def _doubts_of_size(size: Size) -> list[str]:

@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, MovingSurface
 from pipeline.report.colours import SOLID_COLOURS
+from pipeline.report.style import as_moving_webp
 
 FRAMES = 20
 SIZE_PIXELS = (520, 520)
@@ -91,14 +92,26 @@ def even_in_time(moving: MovingSurface, count: int) -> Float32:
     Vertices correspond, so a few phases, unevenly spaced, still make an even motion; the last
     phase leads back to the first.
     """
-    known = np.concatenate([moving.phases, moving.phases[:1] + 1])
     wanted = moving.phases[0] + np.arange(count) / count
-    before = np.searchsorted(known, wanted, side="right") - 1
-    share = (wanted - known[before]) / (known[before + 1] - known[before])
+    return np.stack([vertices_at(moving, phase) for phase in wanted]).astype(np.float32)
+
+
+def vertices_at(moving: MovingSurface, phase: float) -> Float:
+    """Vertices ``(n, 3)``, mm, on straight lines between the stored phases, at a phase that counts
+    from the first of these up to one beat later."""
+    ends = np.append(moving.phases, moving.phases[0] + 1)
+    before = int(np.searchsorted(ends, phase, side="right")) - 1
+    share = (phase - ends[before]) / (ends[before + 1] - ends[before])
     after = (before + 1) % len(moving.phases)
-    path = moving.vertices_mm
-    frames = [(1 - w) * path[i] + w * path[j] for i, j, w in zip(before, after, share, strict=True)]
-    return np.stack(frames).astype(np.float32)
+    return np.asarray((1 - share) * moving.vertices_mm[before] + share * moving.vertices_mm[after])
+
+
+def axes_of_view(towards_viewer: Float) -> Float:
+    """``(3, 3)`` unit vectors to a far viewer's right, up (the patient's head) and towards them."""
+    towards = towards_viewer / np.linalg.norm(towards_viewer)
+    right = np.cross(HEAD, towards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(towards, right), towards])
 
 
 def framing(points_mm: Float) -> tuple[Float, float]:
@@ -109,10 +122,7 @@ def framing(points_mm: Float) -> tuple[Float, float]:
     points_mm
         ``(n, 3)``; everything that is to be in the picture, at all times.
     """
-    towards = TOWARDS_VIEWER / np.linalg.norm(TOWARDS_VIEWER)
-    right = np.cross(HEAD, towards)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(towards, right), towards])
+    axes = axes_of_view(TOWARDS_VIEWER)
     seen = points_mm @ axes.T
     low, high = seen.min(axis=0), seen.max(axis=0)
     wide, tall, _ = (high - low) / 2
@@ -134,17 +144,7 @@ def _webp(frames: Any, rr_s: float) -> bytes:
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
-    buffer = BytesIO()
-    images[0].save(
-        buffer,
-        format="WEBP",
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 * rr_s / len(images)),
-        loop=0,
-        quality=70,
-    )
-    return buffer.getvalue()
+    return as_moving_webp(images, round(1000 * rr_s / len(images)), quality=70)
 
 
 def _draw(work: Path) -> None:

@@ -9,7 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from pipeline.geometry import Float, Integer, MovingSurface, area_vectors
-from pipeline.report.animation import HEAD, TOWARDS_VIEWER
+from pipeline.report.animation import TOWARDS_VIEWER, axes_of_view
 from pipeline.report.colours import SOLID_COLOURS
 
 # Light from the viewer; what turns away keeps this much of it, so that colours can be read.
@@ -65,10 +65,7 @@ def seen_from(corners_mm: Float, towards_viewer: Float) -> tuple[Integer, Float,
     Their numbers ``(k,)``, corners ``(k, 3, 2)`` to the right and up in mm, and light ``(k,)``, 1
     where a triangle faces the viewer squarely.
     """
-    towards = towards_viewer / np.linalg.norm(towards_viewer)
-    right = np.cross(HEAD, towards)
-    right /= np.linalg.norm(right)
-    up = np.cross(towards, right)
+    right, up, towards = axes_of_view(towards_viewer)
     normal = area_vectors(corners_mm)
     length = np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
     squareness = normal @ towards / length

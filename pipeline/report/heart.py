@@ -81,11 +81,7 @@ def movement(
     volumes = as_svg(curves.volume_curves(phases, measures["volumes_ml"]))
     shown.append(picture("Volumes through the cycle", volumes, "svg"))
     shown += _muscle(phases, measures)
-    return Section(
-        "Surfaces",
-        told,
-        shown,
-    )
+    return Section("Surfaces", told, shown)
 
 
 def _muscle(phases: Float, measures: Mapping[str, Any]) -> list[Picture]:
@@ -112,9 +108,7 @@ def function_rows(measures: Mapping[str, Any]) -> list[tuple[str, str]]:
         if volumes is None:
             continue
         largest, smallest = max(volumes), min(volumes)
-        rows.append(
-            (f"{short} volume, largest / smallest", f"{largest:.0f} / {smallest:.0f} ml"),
-        )
+        rows.append((f"{short} volume, largest / smallest", f"{largest:.0f} / {smallest:.0f} ml"))
         rows.append((f"{short} ejection fraction", f"{100 * (1 - smallest / largest):.0f} %"))
         rows.append((f"{short} stroke volume", f"{largest - smallest:.0f} ml"))
     rows.append(("LV mass", f"{mean_lv_mass_g(measures):.0f} g"))

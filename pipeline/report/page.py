@@ -125,16 +125,13 @@ def render(
     opening: Opening,
 ) -> str:
     """The page as HTML; text is escaped."""
-    folder = Path(__file__).parent
     return filled(
-        folder,
+        Path(__file__).parent,
         patient_id=patient_id,
         summary=summary,
         sections=sections,
         example=example,
-        headline=opening.headline,
-        warnings=opening.warnings,
-        told=opening.told,
+        opening=opening,
     )
 
 

@@ -15,14 +15,9 @@ from matplotlib.image import AxesImage
 from pipeline.field.fixture import Fixture
 from pipeline.field.potential import potential
 from pipeline.field.reader import ForceField
-from pipeline.geometry import (
-    Float,
-    Float32,
-    MovingSurface,
-    Surface,
-    transform_points,
-)
+from pipeline.geometry import Float, Float32, MovingSurface, Surface, transform_points
 from pipeline.imaging.labels import LABELS
+from pipeline.report.animation import vertices_at
 from pipeline.report.colours import SURFACE_STYLES
 from pipeline.report.moments import Moments
 from pipeline.report.slices import mark_scale, mark_sides
@@ -164,13 +159,8 @@ def _draw_cuts(
 
 def _between(moving: MovingSurface, phase: float) -> Surface:
     """The surface at any phase, its vertices on straight lines between the stored ones."""
-    ends = np.append(moving.phases, moving.phases[0] + 1)
     turned = moving.phases[0] + (phase - moving.phases[0]) % 1.0
-    before = int(np.searchsorted(ends, turned, side="right")) - 1
-    share = (turned - ends[before]) / (ends[before + 1] - ends[before])
-    after = (before + 1) % len(moving.phases)
-    vertices_mm = (1 - share) * moving.vertices_mm[before] + share * moving.vertices_mm[after]
-    return Surface(vertices_mm, moving.triangles)
+    return Surface(vertices_at(moving, turned), moving.triangles)
 
 
 def plane_cut(surface: Surface, image_from_mr: Float) -> Float:
@@ -179,16 +169,11 @@ def plane_cut(surface: Surface, image_from_mr: Float) -> Float:
     # A vertex in the plane itself would make a segment of no length.
     height = np.where(points[:, 2] == 0, np.finfo(float).tiny, points[:, 2])
     crossing = surface.triangles[np.ptp(np.sign(height)[surface.triangles], axis=1) > 0]
-    ends = []
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        a, b = crossing[:, first], crossing[:, second]
-        share = height[a] / np.where(height[a] == height[b], np.inf, height[a] - height[b])
-        ends.append(points[a, :2] + share[:, None] * (points[b, :2] - points[a, :2]))
-    crosses = np.stack(
-        [height[crossing[:, i]] * height[crossing[:, j]] < 0 for i, j in ((0, 1), (1, 2), (2, 0))],
-        axis=1,
-    )
-    return np.asarray(np.stack(ends, axis=1)[crosses].reshape(-1, 2, 2))
+    # Of each triangle's three sides.
+    a, b = crossing, np.roll(crossing, -1, axis=1)
+    share = height[a] / np.where(height[a] == height[b], np.inf, height[a] - height[b])
+    ends = points[a, :2] + share[..., None] * (points[b, :2] - points[a, :2])
+    return np.asarray(ends[height[a] * height[b] < 0].reshape(-1, 2, 2))
 
 
 def joined(segments: Float) -> list[Float]:

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.geometry import Float, Integer, Label
 from pipeline.imaging.labels import LABELS
 from pipeline.report.colours import STYLES
 from pipeline.report.moments import Moments
-from pipeline.report.style import handle, show_grey
+from pipeline.report.style import edged, handle, show_grey
 
 MOST_SLICES = 24
 """More than these are not shown one by one: a choice of those with heart is."""
@@ -84,13 +83,12 @@ def how_it_lies(shown: Moments) -> str:
 def mark_sides(axis: Axes, shown: Moments) -> None:
     """Write at the four edges of a slice's picture where they lie in the patient, in LPS."""
     right, down, _ = shown.mr_from_index[:3, :3].T
-    edge: list[AbstractPathEffect] = [Stroke(linewidth=2, foreground="black"), Normal()]
     places = {(0.02, 0.5): -right, (0.98, 0.5): right, (0.5, 0.98): -down, (0.5, 0.02): down}
     across, upright = ({0.02: low, 0.5: "center", 0.98: high} for low, high in _EDGES)
     for (x, y), direction in places.items():
-        style: dict[str, Any] = {"ha": across[x], "va": upright[y], "path_effects": edge}
-        text = _letters(direction)
-        axis.text(x, y, text, transform=axis.transAxes, color="white", fontsize=8, **style)
+        style: dict[str, Any] = {"ha": across[x], "va": upright[y], "transform": axis.transAxes}
+        style |= {"color": "white", "fontsize": 8, "path_effects": edged(1, "black")}
+        axis.text(x, y, _letters(direction), **style)
 
 
 def mark_scale(axis: Axes, pixel_mm: float) -> None:
@@ -101,11 +99,9 @@ def mark_scale(axis: Axes, pixel_mm: float) -> None:
     length = SCALE_MM / pixel_mm
     if length > 0.5 * (right - left):
         return
-    edge: list[AbstractPathEffect] = [Stroke(linewidth=4, foreground="black"), Normal()]
-    line: dict[str, Any] = {"color": "white", "lw": 2, "path_effects": edge}
+    line: dict[str, Any] = {"color": "white", "lw": 2, "path_effects": edged(3, "black")}
     axis.plot([start, start + length], [height] * 2, "-", scalex=False, scaley=False, **line)
-    edge = [Stroke(linewidth=2, foreground="black"), Normal()]
-    style: dict[str, Any] = {"color": "white", "fontsize": 8, "path_effects": edge}
+    style: dict[str, Any] = {"color": "white", "fontsize": 8, "path_effects": edged(1, "black")}
     axis.text(start, height + 0.02 * (top - bottom), f"{SCALE_MM:.0f} mm", va="bottom", **style)
 
 
@@ -141,7 +137,8 @@ def contours(
     slices, window = shown_slices(shown.labels, always), shown.window()
     columns = _columns(len(slices))
     rows = ceil(len(slices) / columns)
-    tall = np.ptp(_ends(window[0])) * shown.pixel_aspect / np.ptp(_ends(window[1]))
+    high, wide = (part.stop - part.start for part in window)
+    tall = high * shown.pixel_aspect / wide
     width = min(2.4, 12 / columns)
     size = (max(columns * width, 7.5), rows * (width * tall + 0.25) + 0.35)
     figure = Figure(figsize=size, layout="constrained")
@@ -165,10 +162,6 @@ def _columns(count: int) -> int:
     if count <= 6:
         return count
     return 6 if count <= 18 else 8
-
-
-def _ends(part: slice) -> tuple[int, int]:
-    return int(part.start), int(part.stop)
 
 
 def _outline(axis: Axes, labels: Label) -> None:

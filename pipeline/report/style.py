@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
@@ -43,6 +43,21 @@ def as_webp(figure: Figure, dots_per_inch: int = 100) -> bytes:
     """WebP: a quarter of a PNG's bytes where there are grey values."""
     buffer = BytesIO()
     figure.savefig(buffer, format="webp", dpi=dots_per_inch, pil_kwargs={"quality": 88})
+    return buffer.getvalue()
+
+
+def as_moving_webp(images: Sequence[Any], each_ms: int, quality: int) -> bytes:
+    """Endless animated WebP of Pillow's images, each shown for so long."""
+    buffer = BytesIO()
+    images[0].save(
+        buffer,
+        format="WEBP",
+        save_all=True,
+        append_images=images[1:],
+        duration=each_ms,
+        loop=0,
+        quality=quality,
+    )
     return buffer.getvalue()
 
 

@@ -92,28 +92,20 @@ def fixtures_for(
     InputError
         When a surface that the user asked for is missing.
     """
-    kept = {name: one for name, one in settings.fixtures.items() if one.structure in surfaces}
-    missing = {
-        name: f"needs {one.structure}, which has no surface"
-        for name, one in settings.fixtures.items()
-        if name not in kept
-    }
-    wanted = {
-        f"fixture {name}": one.structure
-        for name, one in settings.fixtures.items()
-        if name in missing and one != DEFAULT_FIXTURES.get(name)
-    }
+    given = settings.fixtures
+    kept = {name: one for name, one in given.items() if one.structure in surfaces}
+    lacking = {name: one.structure for name, one in given.items() if name not in kept}
+    own = {name: of for name, of in lacking.items() if given[name] != DEFAULT_FIXTURES.get(name)}
+    wanted = {f"fixture {name}": of for name, of in own.items()}
     wanted |= {f"bake.structures {name}": name for name in settings.bake.structures if name in lost}
-    if wanted or not kept:
-        wanted = wanted or {
-            f"fixture {name}": settings.fixtures[name].structure for name in missing
-        }
+    if not kept and not wanted:
+        wanted = {f"fixture {name}": of for name, of in lacking.items()}
+    if wanted:
         said = "; ".join(
-            f"{who} needs {name}, which has no surface: {lost[name]}"
-            for who, name in wanted.items()
+            f"{who} needs {of}, which has no surface: {lost[of]}" for who, of in wanted.items()
         )
         raise InputError(f"{said}; take it out of the configuration, or name another structure")
-    return kept, missing
+    return kept, {name: f"needs {of}, which has no surface" for name, of in lacking.items()}
 
 
 def _example(

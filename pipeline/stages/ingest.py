@@ -56,7 +56,7 @@ def run(job: Job) -> dict[str, Any]:
     ecg = None if job.study.ecg.mr is None else read_ecg(job.study.ecg.mr)
     _require_ecg_as_long(job, stack, ecg)
     write_cine(job.folder, stack, views)
-    cine = stack.cine
+    cine, timed = stack.cine, stack.timed or range(len(stack.rr_ms))
     return {
         "phases": len(cine.phases),
         "slices": cine.intensity.shape[1],
@@ -71,9 +71,9 @@ def run(job: Job) -> dict[str, Any]:
             *told_of_views,
             *copies,
             *doubts_of_gaps(cine),
-            *doubts_of_order(stack.cine),
+            *doubts_of_order(cine),
             *doubts_of_range(cine),
-            *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, _timed(stack)),
+            *doubts_of_phases(stack.trigger_times_ms, stack.rr_ms, timed),
             *_doubts_of_beat(job, stack, ecg),
             *_doubts_of_patient(job, stack, ecg),
         ],
@@ -166,11 +166,6 @@ def _require_ecg_as_long(job: Job, stack: Stack, ecg: Ecg | None) -> None:
             f"{len(beats_ms)} slices of a heartbeat each take {needed_s:.1f} s at the least; "
             "give the whole record, or take it out of the study"
         )
-
-
-def _timed(stack: Stack) -> Sequence[int]:
-    """Numbers of the slices that the times are of."""
-    return stack.timed or range(len(stack.rr_ms))
 
 
 def _is_volume(stack: Stack) -> bool:

@@ -36,7 +36,7 @@ def run(job: Job) -> dict[str, Any]:
     """Write ``mr_from_tracker.json``, ``frames.csv``, and the transform for 3D Slicer."""
     if job.study.us is None:
         raise Skipped("no tracked ultrasound: the field is in the frame of the MR")
-    start = _start(job)
+    start = job.study.us.start()
     ecg = _ecg(job.study)
     r_times_s = _r_times_s(job.study, ecg)
     sweeps = _sweeps(job.study, ecg, r_times_s)
@@ -84,12 +84,6 @@ def require_usable(study: Study, settings: RegisterSettings) -> None:
     timing = _timing(study, sweeps, r_times_s, None)
     if settings.on_failure == "stop":
         require_frames(sweeps, timing.phases(), settings)
-
-
-def _start(job: Job) -> Float | None:
-    """The first guess of where the tracker stands; None where the study gives none."""
-    assert job.study.us is not None, "only a study with ultrasound is registered"
-    return job.study.us.start()
 
 
 def _registered(

@@ -25,13 +25,7 @@ from pipeline.report.page import Opening, Section, Table, flat_table, picture, r
 from pipeline.report.provenance import provenance
 from pipeline.report.registered import registration, registration_notes
 from pipeline.report.style import as_png, as_svg, own_style
-from pipeline.summary import (
-    by_reason,
-    cut_off_by,
-    cut_sideways_by,
-    of_timing,
-    series_left_out,
-)
+from pipeline.summary import by_reason, cut_off_by, cut_sideways_by, of_timing, series_left_out
 
 VENTRICLES = {"left ventricle", "right ventricle"}
 """Their volumes are told at the top of the page, whatever the fixtures."""
@@ -182,8 +176,8 @@ def _of_whole_ventricles(
     rows: list[tuple[str, str]], cut_off: Collection[str]
 ) -> list[tuple[str, str]]:
     """The figures of function, with a word beside those of a ventricle that the images cut off."""
-    cut = {name for name in ("left", "right") if f"{name} ventricle" in cut_off}
-    short = tuple({"left": "LV", "right": "RV"}[name] for name in cut)
+    named = {"LV": "left ventricle", "RV": "right ventricle"}
+    short = tuple(letters for letters, name in named.items() if name in cut_off)
     return [
         (name, f"{text} (of what the stack shows)" if name.startswith(short) else text)
         for name, text in rows
@@ -282,10 +276,7 @@ def _field(job: Job, shown: Moments) -> Section:
         ],
         [
             Table(head, rows),
-            *certificate.tables(
-                job.figures("bake")["accuracy"],
-                job.figures("bake")["allowed"],
-            ),
+            *certificate.tables(job.figures("bake")["accuracy"], job.figures("bake")["allowed"]),
         ],
     )
 
