@@ -140,7 +140,7 @@ class _Once(argparse.Action):
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_synth", description="Make synthetic patient studies with known truth."
+        prog="beatfield synth", description="Make synthetic patient studies with known truth."
     )
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="folder to write patient-0001/ ... in"

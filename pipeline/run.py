@@ -249,7 +249,8 @@ def _fail(run: _Run, stage: Stage, error: Exception, seconds: float) -> None:
     standing = _all_stages(run)
     later = [one.name for one in STAGES[STAGES.index(stage) :]]
     left = [name for name in later if (run.products / name).is_dir()]
-    run.stages[stage.name] = {"status": "failed", "cause": str(error)}
+    ended = {"cause": str(error), "seconds": round(seconds, 3)}
+    run.stages[stage.name] = {"status": "failed", **ended}
     run.watcher.ended(stage.name, "failed", seconds)
     _record(run, "failed")
     _warn_of(run, [name for name in left if standing.get(name, {}).get("status") != "done"], error)

@@ -187,4 +187,4 @@ def clock_put_right(register: dict[str, Any]) -> list[str]:
 
 
 def _timed(stage: dict[str, Any]) -> bool:
-    return stage.get("seconds") is not None
+    return stage.get("peak_memory_mb") is not None

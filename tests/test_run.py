@@ -241,7 +241,9 @@ def test_a_failing_stage_publishes_nothing_and_keeps_what_was_finished(kitchen: 
     ]
     record = kitchen.record()
     assert record["status"] == "failed"
-    assert record["stages"]["b"] == {"status": "failed", "cause": "slice 3: no heart"}
+    entry = record["stages"]["b"]
+    assert (entry["status"], entry["cause"]) == ("failed", "slice 3: no heart")
+    assert entry["seconds"] >= 0
     kitchen.bodies.clear()
     kitchen.run()
     assert kitchen.calls == ["b", "c"]
