@@ -53,14 +53,19 @@ def write_dicom(
     SynthError
         When the patient's name does not fit in a DICOM header.
     """
+    require_room(patient_id)
+    write = write_enhanced if enhanced else write_classic
+    for series in _plan(cine, settings, views or {}, enhanced):
+        write(folder / f"{series.number:03d}", patient_id, key, series, settings)
+
+
+def require_room(patient_id: str) -> None:
+    """Raise SynthError when the patient's name does not fit in a DICOM header."""
     if len(patient_id) > LONGEST_PATIENT_ID:
         raise SynthError(
             f"patient_id: {patient_id!r} has {len(patient_id)} characters; DICOM has room for "
             f"{LONGEST_PATIENT_ID}, choose a shorter one"
         )
-    write = write_enhanced if enhanced else write_classic
-    for series in _plan(cine, settings, views or {}, enhanced):
-        write(folder / f"{series.number:03d}", patient_id, key, series, settings)
 
 
 def _plan(

@@ -75,7 +75,8 @@ class EcgSettings(RhythmSettings):
     """Time in which the scanner plays the lines of one picture of a beat."""
     lost: tuple[LostLead, ...] = ()
     """Leads that come off, as `[{lead: II, start_s: 5, end_s: 8, kind: flat}]`. `lead: all` is all
-    of them; `kind` is flat (0 mV; the default) or rail (the end of the amplifier's range)."""
+    of them; `kind` is flat (0 mV; the default) or rail (the end of the amplifier's range). In a
+    study they come off in both recordings, so before the end of the shorter."""
     lost_per_minute: float = Field(default=0.0, ge=0, le=20)
     """How often, besides, a lead comes off at random."""
     lost_mean_s: float = Field(default=3.0, ge=0.2, le=30)

@@ -23,7 +23,8 @@ def measure_heart(heart: BeatingHeart, spacing_mm: float = COARSE_MM) -> dict[st
     Keys: lv_ml, rv_ml (at the R peak), lv_ejection, rv_ejection, lv_stroke_ml, rv_stroke_ml,
     lv_mass_g, la_ml, ra_ml (at end-systole), la_emptying, ra_emptying, lv_wall_mm (mean about the
     middle of the ventricle), lv_wall_largest_mm, lv_wall_smallest_mm, lv_sphericity (width over
-    length). Meshes of 3 mm cut up to 2.5 % off the atria, 1 % off the ventricles.
+    length). Meshes of 3 mm cut up to 2.6 % off the left atrium, 1.6 % off the right
+    ventricle, 1.3 % off the right atrium, 0.7 % off the left ventricle.
     """
     full, empty = (_volumes(heart, phase, spacing_mm) for phase in (0.0, heart.pulse.end_systole))
     measures = {"lv_mass_g": full["lv_myocardium"] * MUSCLE_G_ML}

@@ -65,7 +65,7 @@ class MrSettings(BaseModel):
     breath_hold_shift_mm: float = Field(default=1.5, ge=0, le=10)
     """Standard deviation of the heart's place from one slice's breath-hold to another."""
     planning_error_deg: float = Field(default=3.0, ge=0, le=30)
-    """Standard deviation of a plane's tilt off where it was meant to be."""
+    """Standard deviation of a plane's turn off where it was meant to be, about each axis."""
     volume_axes: Literal["short_axis", "transverse", "sagittal", "coronal"] = "short_axis"
     """Planes of the isotropic volume: the heart's own, or the scanner's."""
     volume_voxel_mm: float = Field(default=2.0, ge=1, le=5)

@@ -72,7 +72,8 @@ class RhythmSettings(BaseModel):
     fibrillation: bool = False
     """Atrial fibrillation: no P waves, no sinus rhythm, intervals without order."""
     fibrillation_s: tuple[float, float] | None = None
-    """Start and end of the fibrillation; the whole recording if left out."""
+    """Start and end of the fibrillation, in a study in both recordings; the whole recording if left
+    out."""
     fibrillation_irregularity: float = Field(default=0.2, ge=0.1, le=0.35)
     """Mean and standard deviation of the exponential part of the intervals, as a fraction of their
     mean: 0.2 of 0.7 s is a rate of decay of 7 Hz, Hennig et al. found 3 to 12."""

@@ -84,7 +84,8 @@ class PhantomSettings(BaseModel):
     spread: float = Field(default=1.0, ge=0, le=2)
     """Width of the population the heart is drawn from: 0 is the mean heart, 1 is nature's."""
     heart_rate_bpm: float = Field(default=75.0, ge=35, le=180)
-    """Mean heart rate of both recordings; systole's share of the beat follows it."""
+    """Mean heart rate of both recordings, before couplets or early atrial beats add to it;
+    systole's share of the beat follows it."""
     cine: Literal["dicom", "enhanced", "nifti"] = "dicom"
     """Classic single-frame DICOM, Enhanced multi-frame DICOM, or NIfTI."""
     long_axis: bool = True
@@ -116,7 +117,8 @@ def read_settings(path: Path | None, changes: dict[str, Any] | None = None) -> P
     Raises
     ------
     SynthError
-        When the file cannot be read, or a key or a value is wrong; all faults are listed.
+        When the file cannot be read, or a key or a value is wrong; all faults are listed, but
+        values that do not go together only once each is right by itself.
     """
     content: Any = {}
     if path is not None:
@@ -148,27 +150,41 @@ def check_settings(content: dict[str, Any], where: str) -> PhantomSettings:
     Raises
     ------
     SynthError
-        When a key or a value is wrong; all faults are listed.
+        When a key or a value is wrong; all faults are listed, as of `read_settings`.
     """
-    if truths := list(_truths(content, PhantomSettings)):
-        raise SynthError(
-            "\n".join(f"{where}: {key}: true and false are no numbers" for key in truths)
-        )
+    truths = list(_truths(content, PhantomSettings))
+    faults = [f"{where}: {key}: true and false are no numbers" for key in truths]
     try:
-        return PhantomSettings.model_validate(content)
+        settings = PhantomSettings.model_validate(content)
     except ValidationError as error:
-        raise SynthError(describe(error, where)) from error
+        # Taken for 1 or 0, a truth may break a limit besides.
+        others = [one for one in error.errors() if _key(one) not in truths]
+        faults += [_told(one, where) for one in others]
+    if faults:
+        raise SynthError("\n".join(faults))
+    return settings
 
 
-def _truths(content: dict[str, Any], model: type[BaseModel], head: str = "") -> Iterator[str]:
+def _truths(value: Any, kind: Any, key: str = "") -> Iterator[str]:
     """Keys of numbers that were given true or false, which the library takes for 1 and 0."""
-    for name, field in model.model_fields.items():
-        value, kinds = content.get(name), {field.annotation, *get_args(field.annotation)}
-        below = [one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)]
-        if below and isinstance(value, dict):
-            yield from _truths(value, below[0], f"{head}{name}.")
-        elif isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
-            yield f"{head}{name}"
+    kinds = set(_kinds(kind))
+    if isinstance(value, list):
+        for number, one in enumerate(value):
+            yield from _truths(one, kind, f"{key}.{number}")
+    elif isinstance(value, dict):
+        head = f"{key}." if key else ""
+        for model in (one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)):
+            for name, field in model.model_fields.items():
+                yield from _truths(value.get(name), field.annotation, f"{head}{name}")
+    elif isinstance(value, bool) and bool not in kinds and kinds & {int, float}:
+        yield key
+
+
+def _kinds(kind: Any) -> Iterator[Any]:
+    """A type with all that it is made of."""
+    yield kind
+    for part in get_args(kind):
+        yield from _kinds(part)
 
 
 def _instead(place: tuple[int | str, ...]) -> str:
@@ -185,13 +201,13 @@ def _instead(place: tuple[int | str, ...]) -> str:
     return f"did you mean {near[0]}?" if near else "check its spelling"
 
 
-def describe(error: ValidationError, where: str) -> str:
-    """Every fault on a line of its own: file, key, what is wrong, what came."""
-    lines = []
-    for one in error.errors():
-        key = ".".join(str(part) for part in one["loc"]) or "(all)"
-        message = one["msg"].removeprefix("Value error, ")
-        if one["type"] == "extra_forbidden":
-            message = f"unknown key; {_instead(one['loc'])}"
-        lines.append(f"{where}: {key}: {message} (got {one['input']!r})")
-    return "\n".join(lines)
+def _key(fault: Any) -> str:
+    return ".".join(str(part) for part in fault["loc"]) or "(all)"
+
+
+def _told(fault: Any, where: str) -> str:
+    """A fault that the library found, in a line: file, key, what is wrong, what came."""
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        message = f"unknown key; {_instead(fault['loc'])}"
+    return f"{where}: {_key(fault)}: {message} (got {fault['input']!r})"

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from data_synth.dicom import write_dicom
+from data_synth.dicom import require_room, write_dicom
 from data_synth.ecg import write_wfdb
 from data_synth.errors import SynthError
 from data_synth.mr import SyntheticCine
@@ -54,6 +54,9 @@ def write_study(
     """
     require_free(folder, overwrite)
     _require_text(folder.absolute())
+    # What cannot be written is refused before a minute is spent on it.
+    if settings.cine != "nifti":
+        require_room(settings.patient_id)
     with publishing(folder) as partial:
         study = simulate_study(settings, progress, done=65)
         _write_recordings(partial, study)
@@ -80,10 +83,19 @@ def _require_text(folder: Path) -> None:
 
 def require_free(folder: Path, overwrite: bool) -> None:
     """Raise SynthError when something is in the way and must not be replaced."""
-    if folder.exists() and not overwrite:
+    there = _exists(folder)
+    if there and not overwrite:
         raise SynthError(f"{folder}: exists; choose another folder or give --overwrite")
-    if folder.exists() and not (folder / "study.yaml").is_file():
+    if there and not (folder / "study.yaml").is_file():
         raise SynthError(f"{folder}: is no study, so it is not overwritten; choose another folder")
+
+
+def _exists(path: Path) -> bool:
+    """Whether something is there; of a name that is too long the path's own method would raise."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def _write_recordings(folder: Path, study: SyntheticStudy) -> None:
@@ -146,13 +158,13 @@ def publishing(target: Path) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         # What one of the same number left when it was killed, as in a container.
-        if old.exists() and not target.exists():
+        if _exists(old) and not _exists(target):
             old.rename(target)
         for left in (partial, old):
             shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
         yield partial
-        if target.exists():
+        if _exists(target):
             target.rename(old)
         partial.rename(target)
     except OSError as error:
@@ -162,6 +174,6 @@ def publishing(target: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        if old.exists() and not target.exists():
+        if _exists(old) and not _exists(target):
             old.rename(target)
         shutil.rmtree(old, ignore_errors=True)

@@ -70,6 +70,47 @@ def test_bad_settings_name_file_key_and_fault(tmp_path, capsys, text, words):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("text", "faulty"),
+    [
+        ("mr: {snr: true, phases: 0}\nsped: 1", ["mr.snr", "mr.phases", "sped"]),
+        ("mr: {phases: true}", ["mr.phases"]),
+        ("ecg: {fibrillation: true, fibrillation_s: [true, 5]}", ["ecg.fibrillation_s.0"]),
+        (
+            "ecg: {lost: [{lead: II, start_s: false, end_s: 4}], lost_per_minute: 99}",
+            ["ecg.lost.0.start_s", "ecg.lost_per_minute"],
+        ),
+    ],
+)
+def test_every_fault_of_a_file_is_told_once(tmp_path, text, faulty):
+    config = tmp_path / "bad.yaml"
+    config.write_text(text)
+    with pytest.raises(SynthError) as told:
+        read_settings(config)
+    lines = str(told.value).split("\n")
+    assert sorted(line.split(": ")[1] for line in lines) == sorted(faulty)
+
+
+def test_a_name_too_long_for_dicom_is_refused_before_the_heart_is_drawn(
+    tmp_path, monkeypatch, capsys
+):
+    config = tmp_path / "long.yaml"
+    config.write_text(f"patient_id: {'x' * 57}\n")
+    monkeypatch.setattr("data_synth.study.simulate_study", lambda *_: pytest.fail("simulated"))
+    assert main([str(tmp_path / "out"), "--config", str(config)]) == 2
+    assert "patient_id" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("out", ["out", "x" * 300], ids=["hidden folder's", "place's"])
+def test_a_name_too_long_for_the_system_is_told(tmp_path, capsys, out):
+    config = tmp_path / "long.yaml"
+    # With the marks of a hidden folder about it, it passes 255 bytes, the most of Linux.
+    config.write_text(f"cine: nifti\npatient_id: {'x' * 250}\n")
+    assert main([str(tmp_path / out), "--config", str(config)]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
 def test_a_section_of_comments_alone_is_the_default(tmp_path):
     (tmp_path / "p.yaml").write_text("seed: 4\nmr:\n  # pixel_mm: 2\n")
     assert read_settings(tmp_path / "p.yaml") == PhantomSettings(seed=4)
