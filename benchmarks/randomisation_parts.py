@@ -87,7 +87,7 @@ def overlaps(stack: Stack) -> list[float] | None:
 def all_overlaps(weights: Path, stacks: list[Stack]) -> list[list[float] | None]:
     """Dice of each stack by the pipeline with other weights than its own."""
     network.WEIGHTS = weights
-    network.load_network.cache_clear()
+    network.idle.clear()
     return [overlaps(stack) for stack in stacks]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InputError
+from pipeline.field.threads import processors
 from pipeline.geometry import Float, Label, MovingSurface, Surface
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.labels import LABELS
@@ -141,9 +143,14 @@ def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
 
 def write_surfaces(folder: Path, surfaces: Mapping[str, MovingSurface]) -> None:
     """``<structure>_000.vtp`` ..., one file a structure and phase."""
-    for name, moving in surfaces.items():
-        for number in range(len(moving.phases)):
-            write_vtp(folder / f"{name}_{number:03d}.vtp", moving.at(number))
+
+    def write(name: str, number: int) -> None:
+        write_vtp(folder / f"{name}_{number:03d}.vtp", surfaces[name].at(number))
+
+    every = [(name, k) for name, moving in surfaces.items() for k in range(len(moving.phases))]
+    # VTK lets other threads run while it packs.
+    with ThreadPoolExecutor(processors()) as pool:
+        list(pool.map(write, *zip(*every, strict=True)))
 
 
 def read_surfaces(folder: Path, phases: Float) -> dict[str, MovingSurface]:

@@ -178,12 +178,15 @@ def test_slices_whose_labels_come_and_go_are_looked_at_in_all_ways(monkeypatch):
 
     monkeypatch.setattr(inference, "_predicted", predicted)
     found = inference.label_probability(cine, view, 5).value[:, :, :, 30, 30]
-    base = [look for look in looks if look[1] == tuple(range(12))]
+    halves = [
+        [look for look in looks if look[1] == tuple(range(*half))] for half in ((0, 6), (6, 12))
+    ]
     more = [look for look in looks if look[1] == (4,)]
-    assert len(base) + len(more) == len(looks)
+    assert len(halves[0]) + len(halves[1]) + len(more) == len(looks)
     for phase in range(24):
-        ways = [[turn for k, _, turn in kind if k == phase] for kind in (base, more)]
+        ways = [[turn for k, _, turn in kind if k == phase] for kind in (halves[0], more)]
         assert len(ways[0]) == 2
+        assert sorted(turn for k, _, turn in halves[1] if k == phase) == sorted(ways[0])
         assert sorted(ways[0] + ways[1]) == sorted(inference.turns_deg(phase, 5))
     of_slice = found.reshape(24, 12, 3, 7)
     np.testing.assert_allclose(of_slice[::12, 4, :2, atrium], 2 / 5, atol=1e-6)
@@ -255,6 +258,20 @@ def test_the_network_says_the_same_where_opencv_has_no_classic_engine(monkeypatc
     found = predict(images)
     monkeypatch.delattr(cv2.dnn, "ENGINE_CLASSIC", raising=False)
     newer = read_onnx(WEIGHTS)
-    monkeypatch.setattr(network, "load_network", lambda: newer)
+    monkeypatch.setattr(network, "idle", [newer])
     # Single precision, some 20 layers deep with sums of up to 2448 terms; Winograd's rounds more.
     np.testing.assert_allclose(predict(images), found, atol=1e-3)
+
+
+def test_threads_that_ask_at_once_are_answered_as_one_alone_is(monkeypatch):
+    monkeypatch.setattr(network, "idle", [])
+    images = np.random.default_rng(5).uniform(0, 1, (6, 1, 3, 64, 64)).astype(np.float32)
+    alone = [predict(one) for one in images]
+    threads = cv2.getNumThreads()
+    with network.side_by_side() as pool:
+        together = list(pool.map(predict, images))
+        assert cv2.getNumThreads() == 1
+    np.testing.assert_array_equal(together, alone)
+    assert cv2.getNumThreads() == threads
+    # One was read for each of the threads that asked at the same time, at most.
+    assert 1 <= len(network.idle) <= network.MOST_THREADS

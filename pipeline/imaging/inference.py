@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.imaging.network import (
     normalise,
     normalise_locally,
     predict,
+    side_by_side,
 )
 from pipeline.imaging.view import View
 from pipeline.progress import Progress
@@ -146,25 +148,34 @@ def label_probability(
     value = np.zeros((phases, slices * planes, CLASSES, *view.shape), np.float32)
     total = value.reshape(phases, slices, planes, CLASSES, *view.shape)
 
-    def look(phase: int, chosen: Sequence[int], turn_deg: float) -> None:
-        alone = count > 1 and turn_deg == ALONE_DEG
-        seen = _predicted(cine, view, phase, chosen, turn_deg, alone)
-        total[phase, chosen] += seen[:, _kept(planes)]
+    def look(phase: int, chosen: Sequence[int], turns: Sequence[float], before: int = 0) -> None:
+        """Take turns into the mean over the ``before`` that were seen."""
+        seen = total[phase, chosen] * np.float32(before)
+        for turn_deg in turns:
+            alone = count > 1 and turn_deg == ALONE_DEG
+            chance = _predicted(cine, view, phase, chosen, turn_deg, alone)
+            seen += chance[:, _kept(planes)]
+        total[phase, chosen] = seen / np.float32(before + len(turns))
 
-    for phase in range(phases):
-        for turn_deg in turns_deg(phase, count):
-            look(phase, range(slices), turn_deg)
-        total[phase] /= count
-        if progress is not None:
-            progress(phase + 1, phases)
-    doubted = doubted_planes(value, view.pixel_mm).reshape(slices, planes).any(axis=1)
-    chosen = np.flatnonzero(doubted).tolist()
-    for phase in range(phases) if chosen else ():
-        more = more_turns_deg(phase, count, most_views, phases * len(chosen))
-        total[phase, chosen] *= count
-        for turn_deg in more:
-            look(phase, chosen, turn_deg)
-        total[phase, chosen] /= count + len(more)
+    def look_first(piece: tuple[int, Sequence[int]]) -> None:
+        phase, chosen = piece
+        look(phase, chosen, turns_deg(phase, count))
+
+    def look_again(phase: int) -> None:
+        more = more_turns_deg(phase, count, most_views, phases * len(doubted))
+        look(phase, doubted, more, count)
+
+    # In halves, of an odd number of phases as many fall to each of two threads.
+    halves = [half.tolist() for half in np.array_split(np.arange(slices), 2)]
+    with side_by_side() as pool:
+        done = pool.map(look_first, product(range(phases), halves))
+        for number, _ in enumerate(done):
+            if progress is not None and number % 2:
+                progress(number // 2 + 1, phases)
+        every = doubted_planes(value, view.pixel_mm).reshape(slices, planes).any(axis=1)
+        doubted = np.flatnonzero(every).tolist()
+        if doubted:
+            list(pool.map(look_again, range(phases)))
     return PlaneProbability(value, view, planes)
 
 

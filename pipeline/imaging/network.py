@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import cv2
 import numpy as np
 
 from pipeline.errors import StageError
+from pipeline.field.threads import processors
 from pipeline.geometry import Float32, Mask
 from pipeline.imaging.labels import LABELS
 
@@ -32,9 +35,15 @@ NEIGHBOUR_MM = 9.0
 """Distance of neighbours that the network was trained around."""
 
 
-@cache
+MOST_THREADS = 8
+"""Threads that run networks at the same time, at most: each needs some 100 MB."""
+
+idle: list[Any] = []
+"""Networks that were read and that no thread runs now."""
+
+
 def load_network() -> Any:
-    """The network, read once.
+    """The network, read anew: one cannot be run by two threads at once.
 
     Raises
     ------
@@ -78,13 +87,13 @@ def predict(images: Float32) -> Float32:
     -------
     (n, 3, 7, row, column) array
         On the plane a third of the way towards the apex-side neighbour, at the slice, and a third
-        of the way towards the base-side neighbour.
+        of the way towards the base-side neighbour. Threads may ask at the same time.
     """
-    network = load_network()
-    parts = []
-    for start in range(0, len(images), BATCH):
-        network.setInput(np.ascontiguousarray(images[start : start + BATCH]), "images")
-        parts.append(network.forward("scores").copy())
+    with _network() as network:
+        parts = []
+        for start in range(0, len(images), BATCH):
+            network.setInput(np.ascontiguousarray(images[start : start + BATCH]), "images")
+            parts.append(network.forward("scores").copy())
     scores = np.concatenate(parts)
     n, _, rows, columns = scores.shape
     scores = scores.reshape(n, PLANES, CLASSES, rows, columns)
@@ -92,6 +101,35 @@ def predict(images: Float32) -> Float32:
     chance = np.exp(scores, out=scores)
     chance /= chance.sum(axis=2, keepdims=True)
     return np.asarray(chance, np.float32)
+
+
+@contextmanager
+def _network() -> Iterator[Any]:
+    """A network for this thread alone."""
+    try:
+        network = idle.pop()
+    except IndexError:
+        network = load_network()
+    try:
+        yield network
+    finally:
+        idle.append(network)
+
+
+@contextmanager
+def side_by_side() -> Iterator[ThreadPoolExecutor]:
+    """Threads that run networks at the same time, each on images of its own.
+
+    OpenCV's own threads share the layers of one image and wait for each other at every one:
+    meanwhile there are none.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with ThreadPoolExecutor(min(processors(), MOST_THREADS)) as pool:
+            yield pool
+    finally:
+        cv2.setNumThreads(before)
 
 
 def normalise(image: Float32, known: Mask | None = None) -> Float32:

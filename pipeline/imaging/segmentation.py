@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.alignment import ASTRAY_MM, slice_shifts_mm
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cleanup import clean_cycle
+from pipeline.imaging.cleanup import THREADS, clean_cycle
 from pipeline.imaging.confidence import slice_confidence
 from pipeline.imaging.dark_line import end_at_dark_line
 from pipeline.imaging.faults import require_room_for_a_heart
@@ -317,7 +318,8 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
     """Labels on the cine's pixels, in its own order of slices."""
     labels = np.zeros(cine.intensity.shape, np.uint8)
     _, _, rows, columns = cine.intensity.shape
-    for phase in range(len(labels)):
+
+    def draw(phase: int) -> None:
         probability = found.at_slices(phase)
         for number, z in enumerate(found.view.order):
             margins = class_margins(probability[number])
@@ -327,4 +329,7 @@ def _on_cine(found: PlaneProbability, cine: Cine) -> Label:
             carried = [found.view.restore(one, number, (rows, columns)) for one in margins]
             chance: Float32 = np.stack([carried[0] + 2, *carried[1:]])
             labels[phase, z] = most_probable(chance, axis=0)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(draw, range(len(labels))))
     return labels

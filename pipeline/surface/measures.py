@@ -142,10 +142,12 @@ def wall_thickness_mm(
     if axis is not None:
         walled = ~on_lid(first, axis)
         names = segment_names(first, walled, axis, right.at(0) if right else None, mirrored)
+    phases = range(len(inner.phases))
     thickness = np.stack(
-        [_to_wall(inner.vertices_mm[k], outer.at(k), axis) for k in range(len(inner.phases))]
+        [_to_wall(inner.vertices_mm[k, walled], outer.at(k), axis) for k in phases]
     )
-    return _mean(thickness, weights, walled), {
+    weights, names = weights[walled], names[walled]
+    return np.average(thickness, axis=1, weights=weights), {
         name: _mean(thickness, weights, names == name) for name in _ordered(names)
     }
 
