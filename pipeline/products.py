@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InputError
 from pipeline.field.threads import processors
-from pipeline.geometry import Float, Label, MovingSurface, Surface
+from pipeline.geometry import Float, Label, MovingSurface
 from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.long_axis_series import LongAxis
@@ -23,6 +23,9 @@ from pipeline.imaging.nifti import LPS_FROM_RAS, read_image, write_image
 from pipeline.meshes import read_mesh, write_vtp
 from pipeline.registration.clock import to_cycle
 from pipeline.sealing import PHASE_FILE
+
+One = TypeVar("One")
+What = TypeVar("What")
 
 
 def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> None:
@@ -114,8 +117,11 @@ def _compact(intensity: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
 
 def write_labels(folder: Path, stem: str, labels: Label, mr_from_index: Float) -> None:
     """``<stem>_000.nii.gz`` ..., one file a phase, from ``(phase, z, y, x)``."""
-    for number, volume in enumerate(labels):
-        write_image(folder / f"{stem}_{number:03d}.nii.gz", volume, mr_from_index)
+
+    def write(number: int) -> None:
+        write_image(folder / f"{stem}_{number:03d}.nii.gz", labels[number], mr_from_index)
+
+    _each(write, range(len(labels)))
 
 
 def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
@@ -129,7 +135,7 @@ def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
     paths = sorted(one for one in folder.glob(f"{stem}_*.nii.gz") if PHASE_FILE.search(one.name))
     if not paths:
         raise InputError(f"{folder}: holds no {stem}_000.nii.gz ...; give the labels of each phase")
-    volumes = [read_image(path) for path in paths]
+    volumes = _each(read_image, paths)
     for path, (volume, _) in zip(paths, volumes, strict=True):
         others = np.setdiff1d(np.unique(volume), [0, *LABELS.values()])
         if len(others):
@@ -143,14 +149,12 @@ def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
 
 def write_surfaces(folder: Path, surfaces: Mapping[str, MovingSurface]) -> None:
     """``<structure>_000.vtp`` ..., one file a structure and phase."""
+    for name, moving in surfaces.items():
 
-    def write(name: str, number: int) -> None:
-        write_vtp(folder / f"{name}_{number:03d}.vtp", surfaces[name].at(number))
+        def write(number: int, name: str = name, moving: MovingSurface = moving) -> None:
+            write_vtp(folder / f"{name}_{number:03d}.vtp", moving.at(number))
 
-    every = [(name, k) for name, moving in surfaces.items() for k in range(len(moving.phases))]
-    # VTK lets other threads run while it packs.
-    with ThreadPoolExecutor(processors()) as pool:
-        list(pool.map(write, *zip(*every, strict=True)))
+        _each(write, range(len(moving.phases)))
 
 
 def read_surfaces(folder: Path, phases: Float) -> dict[str, MovingSurface]:
@@ -161,11 +165,16 @@ def read_surfaces(folder: Path, phases: Float) -> dict[str, MovingSurface]:
 
 
 def _read_moving(folder: Path, name: str, phases: Float) -> MovingSurface:
-    each: list[Surface] = [
-        read_mesh(folder / f"{name}_{number:03d}.vtp") for number in range(len(phases))
-    ]
+    paths = [folder / f"{name}_{number:03d}.vtp" for number in range(len(phases))]
+    each = _each(read_mesh, paths)
     vertices_mm = np.stack([surface.vertices_mm for surface in each])
     return MovingSurface(vertices_mm, each[0].triangles, phases)
+
+
+def _each(work: Callable[[One], What], every: Iterable[One]) -> list[What]:
+    """What files of one kind each give, in order; while one is packed or unpacked, another is."""
+    with ThreadPoolExecutor(processors()) as pool:
+        return list(pool.map(work, every))
 
 
 def write_slicer_transform(path: Path, mr_from_tracker: Float) -> None:
