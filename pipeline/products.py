@@ -45,6 +45,7 @@ def write_cine(folder: Path, stack: Stack, views: Sequence[LongAxis] = ()) -> No
             "timing_source": stack.timing_source,
             "left_out": list(stack.left_out),
             "interpolated_slices": list(cine.interpolated),
+            "blank_ends": list(stack.blank_ends),
             "long_axis": [
                 {"name": view.name, "phases": view.cine.phases.tolist(), "rr_s": view.cine.rr_s}
                 for view in views
@@ -78,6 +79,12 @@ def read_cine(folder: Path) -> Cine:
         tuple(timing.get("interpolated_slices", ())),
         _moments(timing),
     )
+
+
+def read_blank_ends(folder: Path) -> tuple[int, int]:
+    """`Stack.blank_ends` of what ``write_cine`` wrote."""
+    before, after = read_table(folder / "phases.json").get("blank_ends", (0, 0))
+    return before, after
 
 
 def _moments(timing: Mapping[str, Any]) -> Float | None:
@@ -115,13 +122,23 @@ def _compact(intensity: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
     return whole.astype(np.int16) if fits and np.array_equal(whole, intensity) else intensity
 
 
-def write_labels(folder: Path, stem: str, labels: Label, mr_from_index: Float) -> None:
-    """``<stem>_000.nii.gz`` ..., one file a phase, from ``(phase, z, y, x)``."""
+def write_labels(
+    folder: Path,
+    stem: str,
+    labels: Label,
+    mr_from_index: Float,
+    blank_ends: tuple[int, int] = (0, 0),
+) -> None:
+    """``<stem>_000.nii.gz`` ..., one file a phase, from ``(phase, z, y, x)``, with so many empty
+    slices before and after."""
+    whole = np.pad(labels, ((0, 0), blank_ends, (0, 0), (0, 0)))
+    frame = mr_from_index.copy()
+    frame[:3, 3] -= blank_ends[0] * frame[:3, 2]
 
     def write(number: int) -> None:
-        write_image(folder / f"{stem}_{number:03d}.nii.gz", labels[number], mr_from_index)
+        write_image(folder / f"{stem}_{number:03d}.nii.gz", whole[number], frame)
 
-    _each(write, range(len(labels)))
+    _each(write, range(len(whole)))
 
 
 def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:

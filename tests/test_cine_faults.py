@@ -616,6 +616,7 @@ def test_slices_at_the_ends_that_show_nothing_are_left_out_and_told(drawn: tuple
     _, remark = left.remarks
     assert remark.startswith("3 slices at the ends of the stack show nothing in any phase")
     assert "slice 2 of the files is slice 0" in remark
+    assert left.blank_ends == (2, 1)
     # Nothing at the ends, or nothing at all: as it was.
     assert without_blank_ends(left) is left
     for shown in (0, 2):

@@ -243,6 +243,24 @@ def test_what_truth_never_shows_is_not_held_against_labels(job: Job) -> None:
     assert metrics["labels_without_truth"] == [name for name, value in LABELS.items() if value > 1]
 
 
+def test_labels_are_on_the_files_slices_and_measured_on_those_that_show_something(job: Job) -> None:
+    """Two blank slices before the cine's three and one after them."""
+    assert job.study.truth is not None
+    evaluate.run(job)
+    without = json.loads((job.folder / "metrics.json").read_text())
+    ingest = job.products / "ingest" / "phases.json"
+    write_table(ingest, {**json.loads(ingest.read_text()), "blank_ends": [2, 1]})
+    for folder in (job.products / "segment", job.study.truth):
+        labels, mr_from_index = read_labels(folder, "labels")
+        write_labels(folder, "labels", labels, mr_from_index, (2, 1))
+        whole, mr_from_whole = read_labels(folder, "labels")
+        np.testing.assert_array_equal(whole[:, 2:-1], labels)
+        assert not whole[:, [0, 1, -1]].any()
+        np.testing.assert_allclose(mr_from_whole @ [5, 4, 2, 1], mr_from_index @ [5, 4, 0, 1])
+    evaluate.run(job)
+    assert json.loads((job.folder / "metrics.json").read_text()) == without
+
+
 def test_truth_of_another_cine_is_refused(job: Job) -> None:
     assert job.study.truth is not None
     write_labels(job.study.truth, "labels", np.zeros((2, 4, 8, 8), np.uint8), np.eye(4))

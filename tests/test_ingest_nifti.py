@@ -12,7 +12,7 @@ import pytest
 from pipeline.config import Settings
 from pipeline.errors import InputError
 from pipeline.job import Job
-from pipeline.products import read_cine, read_long_axis
+from pipeline.products import read_blank_ends, read_cine, read_long_axis
 from pipeline.stages import ingest
 from pipeline.study import open_study
 from tests.outside_heart import Scan, render
@@ -78,7 +78,9 @@ def test_spoilt_slices_are_counted_as_messages_do_without_blank_ends(tmp_path: P
     assert "slice 1 of the files is slice 0 from here on" in refused.value.__notes__[0]
     (tmp_path / "out").rmdir()
     (tmp_path / "p" / "study.yaml").write_text("cine: {spoilt_slices: [3]}\n")
-    cine = read_cine(ingested(tmp_path / "p")[0])
+    folder = ingested(tmp_path / "p")[0]
+    assert read_blank_ends(folder) == (1, 0)
+    cine = read_cine(folder)
     assert cine.interpolated == (3,)
     mean = (data[:, :, 2] + data[:, :, 4]) / 2
     np.testing.assert_allclose(cine.intensity.T[:, :, 3], mean, rtol=1e-6)

@@ -88,6 +88,9 @@ class Stack:
     patient: str = ""
     """The patient's identifier; empty where the files do not tell."""
 
+    blank_ends: tuple[int, int] = (0, 0)
+    """Slices of the files before the cine's and after them, which show nothing in any phase."""
+
 
 def stack_frames(
     frames: Sequence[Frame],

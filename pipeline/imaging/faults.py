@@ -173,6 +173,7 @@ def without_blank_ends(stack: Stack) -> Stack:
         rr_ms=stack.rr_ms[timed],
         timed=tuple(int(one) - first for one in numbers[timed]) if stack.timed else (),
         remarks=(*stack.remarks, remark),
+        blank_ends=(first, len(blank) - within.stop),
     )
 
 

@@ -24,7 +24,14 @@ from pipeline.imaging.labels import LABELS
 from pipeline.imaging.nifti_doubts import SAME_PLACE_MM
 from pipeline.job import Job, Skipped
 from pipeline.meshes import read_mesh
-from pipeline.products import read_frames, read_labels, read_surfaces, read_table, write_table
+from pipeline.products import (
+    read_blank_ends,
+    read_frames,
+    read_labels,
+    read_surfaces,
+    read_table,
+    write_table,
+)
 from pipeline.registration.clock import to_cycle
 from pipeline.surface.measures import ejection_fraction, mean_lv_mass_g, volumes_ml
 
@@ -144,7 +151,8 @@ def _motion(moving: MovingSurface, known: list[Surface]) -> dict[str, Any]:
 
 
 def _labels(job: Job, truth: Path) -> tuple[Label, Label]:
-    """Labels found and true on the cine's own pixels, ``(phase, z, y, x)``."""
+    """Labels found and true on the cine's own pixels, ``(phase, z, y, x)``, but for the files'
+    blank ends, which have no number."""
     found, mr_from_found = read_labels(job.products / "segment", "labels")
     known, mr_from_known = read_labels(truth, "labels")
     if found.shape != known.shape:
@@ -159,7 +167,9 @@ def _labels(job: Job, truth: Path) -> tuple[Label, Label]:
             f"{SAME_PLACE_MM:g} mm is rounding; truth and cine must be of one study, its pixels "
             "stored in one order: give the truth of this cine, or take truth/ out"
         )
-    return found, known
+    before, after = read_blank_ends(job.products / "ingest")
+    shown = slice(before, found.shape[1] - after)
+    return found[:, shown], known[:, shown]
 
 
 def _overlap(found: Label, known: Label) -> dict[str, list[float]]:

@@ -18,7 +18,13 @@ from pipeline.imaging.nifti import read_image
 from pipeline.imaging.settings import LOW_CONFIDENCE
 from pipeline.imaging.view import AS_THE_FILE_SAYS
 from pipeline.job import Job
-from pipeline.products import read_cine, read_frames, read_surfaces, read_table
+from pipeline.products import (
+    read_blank_ends,
+    read_cine,
+    read_frames,
+    read_surfaces,
+    read_table,
+)
 from pipeline.report import certificate, heart, pictures, slices
 from pipeline.report.moments import Moments
 from pipeline.report.page import Opening, Section, Table, flat_table, picture, render
@@ -80,7 +86,9 @@ def run(job: Job) -> dict[str, Any]:
 def _moments(job: Job, cine: Cine, numbers: tuple[int, int]) -> Moments:
     """End-diastole and end-systole, by the numbers of their phases."""
     folder = job.products / "segment"
-    labels = [read_image(folder / f"labels_{number:03d}.nii.gz")[0] for number in numbers]
+    first, _ = read_blank_ends(job.products / "ingest")
+    shown = slice(first, first + cine.intensity.shape[1])
+    labels = [read_image(folder / f"labels_{number:03d}.nii.gz")[0][shown] for number in numbers]
     return Moments(
         names=("End-diastole", "End-systole"),
         numbers=numbers,

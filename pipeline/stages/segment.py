@@ -10,7 +10,13 @@ from pipeline.imaging.cut_off import cut_off, cut_sideways
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.segmentation import segment_cine
 from pipeline.job import Job
-from pipeline.products import read_cine, read_long_axis, write_labels, write_table
+from pipeline.products import (
+    read_blank_ends,
+    read_cine,
+    read_long_axis,
+    write_labels,
+    write_table,
+)
 
 
 def run(job: Job) -> dict[str, Any]:
@@ -19,7 +25,9 @@ def run(job: Job) -> dict[str, Any]:
     views = read_long_axis(job.products / "ingest")
     images = [view.cine for view in views]
     found = segment_cine(cine, job.settings.segment, job.progress, images)
-    write_labels(job.folder, "labels", found.labels, cine.mr_from_index)
+    # On the files' own slices, so that labels drawn there by hand compare voxel by voxel.
+    blank_ends = read_blank_ends(job.products / "ingest")
+    write_labels(job.folder, "labels", found.labels, cine.mr_from_index, blank_ends)
     write_labels(job.folder, "heart", found.heart, found.heart_mr_from_index)
     write_table(job.folder / "labels.json", LABELS)
     write_table(
