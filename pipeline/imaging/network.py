@@ -130,6 +130,8 @@ def side_by_side() -> Iterator[ThreadPoolExecutor]:
             yield pool
     finally:
         cv2.setNumThreads(before)
+        # Each holds the layers of the images that it saw last.
+        del idle[1:]
 
 
 def normalise(image: Float32, known: Mask | None = None) -> Float32:
