@@ -147,13 +147,19 @@ def read_labels(folder: Path, stem: str) -> tuple[Label, Float]:
     Raises
     ------
     InputError
-        When there are none, or a file holds what is no label.
+        When there are none, a file holds what is no label, or files differ in shape.
     """
     paths = sorted(one for one in folder.glob(f"{stem}_*.nii.gz") if PHASE_FILE.search(one.name))
     if not paths:
         raise InputError(f"{folder}: holds no {stem}_000.nii.gz ...; give the labels of each phase")
     volumes = _each(read_image, paths)
+    shape = volumes[0][0].shape
     for path, (volume, _) in zip(paths, volumes, strict=True):
+        if volume.shape != shape:
+            raise InputError(
+                f"{path}: its labels are {volume.shape} (slice, row, column), those of "
+                f"{paths[0].name} are {shape}; give labels of one grid in every phase"
+            )
         others = np.setdiff1d(np.unique(volume), [0, *LABELS.values()])
         if len(others):
             known = ", ".join(f"{value} {name}" for name, value in LABELS.items())

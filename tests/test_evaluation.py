@@ -24,7 +24,14 @@ from pipeline.evaluation.metrics import (
 )
 from pipeline.exact import ExactSurface
 from pipeline.geometry import Float, MovingSurface, Surface, transform_points
-from pipeline.products import FrameRow, write_frames, write_surfaces, write_table
+from pipeline.products import (
+    FrameRow,
+    read_labels,
+    write_frames,
+    write_labels,
+    write_surfaces,
+    write_table,
+)
 from pipeline.stages.evaluate import (
     _frame_phase_errors,
     _headline,
@@ -401,3 +408,45 @@ def test_a_surface_that_one_phase_turns_inside_out_is_not_outward():
     path = np.stack([cube.vertices_mm, cube.vertices_mm * (-1, 1, 1)])
     found = _structure(MovingSurface(path, cube.triangles, np.array([0, 0.5])), [cube, cube])
     assert (found["closed"], found["outward"]) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"volumes_ml": None}, "volumes_ml is no JSON object"),
+        ({"us_frames": []}, "us_frames is no JSON object"),
+        ({"phases": ["a"]}, "phases needs a list of finite numbers"),
+        ({"phases": [[0.0], [0.5, 0.7]]}, "phases needs a list of finite numbers"),
+        ({"lv_mass_g": None}, "lv_mass_g needs a finite number"),
+        ({"volumes_ml": {"lv_endocardium": [], "rv_endocardium": [1]}}, "lv_endocardium needs"),
+        ({"mr_from_tracker": np.eye(3).tolist()}, "no 4x4 matrix with an inverse"),
+        ({"mr_from_tracker": np.zeros((4, 4)).tolist()}, "no 4x4 matrix with an inverse"),
+    ],
+)
+def test_truth_of_another_kind_is_refused_in_words(tmp_path, change, words):
+    whole = {
+        "phases": [0.0, 0.5],
+        "volumes_ml": {"lv_endocardium": [2, 1], "rv_endocardium": [2, 1]},
+        "lv_mass_g": 80,
+        "mr_from_tracker": np.eye(4).tolist(),
+        "us_frames": {},
+    }
+    write_table(tmp_path / "truth.json", whole)
+    assert _read_truth(tmp_path, registered=True) == whole
+    write_table(tmp_path / "truth.json", whole | change)
+    with pytest.raises(InputError, match=words):
+        _read_truth(tmp_path, registered=True)
+
+
+def test_truth_that_is_no_object_is_refused_in_words(tmp_path):
+    (tmp_path / "truth.json").write_text("3")
+    with pytest.raises(InputError, match="no JSON object"):
+        _read_truth(tmp_path, registered=False)
+
+
+def test_labels_of_phases_that_differ_in_shape_are_refused(tmp_path):
+    write_labels(tmp_path, "labels", np.zeros((2, 2, 3, 4), np.uint8), np.eye(4))
+    write_labels(tmp_path, "other", np.zeros((1, 2, 3, 5), np.uint8), np.eye(4))
+    (tmp_path / "other_000.nii.gz").replace(tmp_path / "labels_001.nii.gz")
+    with pytest.raises(InputError, match=r"labels_001.*\(2, 3, 5\).*\(2, 3, 4\)"):
+        read_labels(tmp_path, "labels")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from pipeline.paper import robustness
 from pipeline.paper.constrained_motion import _shown, phases_between
 from pipeline.paper.dissection import clock, rows_of
 from pipeline.paper.laws import slopes
+from pipeline.paper.options import PaperOptions
 from pipeline.paper.reader_time import percentiles_us
 from pipeline.paper.subject import open_subject
 from pipeline.paper.torus_tool import frame_about, ring
@@ -181,3 +183,11 @@ def test_the_heart_of_figure_6_beats_as_the_frames_tell(rr_s: float) -> None:
     found = phases_between(times_s, times_s / rr_s % 1, at_s, 0.9 * rr_s)
     away = (found - at_s / rr_s + 0.5) % 1 - 0.5
     np.testing.assert_allclose(away, 0, atol=1e-9)
+
+
+def test_the_command_of_a_part_can_be_pasted_and_names_the_study():
+    chosen = PaperOptions(products=Path("my products"), study=Path("a study"))
+    words = shlex.split(chosen.command())
+    assert words[words.index("--products") + 1] == "my products"
+    assert words[words.index("--study") + 1] == "a study"
+    assert "--study mine" in PaperOptions(study=Path("mine")).command()

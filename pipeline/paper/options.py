@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,8 +39,12 @@ class PaperOptions:
 
     def command(self) -> str:
         """What to type to make a part again, but for its name."""
-        also = f" --study {self.study}" if self.study else ""
-        chosen = "" if self.products == DEMO_PRODUCTS else f" --products {self.products}{also}"
+        chosen = ""
+        # The line is there to be pasted, and names may hold spaces.
+        if self.products != DEMO_PRODUCTS:
+            chosen += f" --products {shlex.quote(str(self.products))}"
+        if self.study:
+            chosen += f" --study {shlex.quote(str(self.study))}"
         return f"beatfield paper OUT{chosen} --seed {self.seed} --operators {self.operators}"
 
 

@@ -86,16 +86,50 @@ def _read_truth(truth: Path, registered: bool) -> dict[str, Any]:
         known = read_table(truth / "truth.json")
     except (OSError, ValueError) as error:
         raise InputError(f"{truth}/truth.json: cannot be read ({error})") from error
+    if not isinstance(known, dict):
+        raise InputError(f"{truth}/truth.json: is no JSON object; give truth, or take truth/ out")
     needed = [*NEEDED_OF_TRUTH, *(("mr_from_tracker", "us_frames") if registered else ())]
     if lacking := [name for name in needed if name not in known]:
         raise InputError(
             f"{truth}/truth.json: has no {', '.join(lacking)}; it needs {', '.join(needed)}, as "
             "docs/phantom.md has them: add them, or take truth/ out"
         )
+    for name in ("volumes_ml", "us_frames"):
+        if name in needed and not isinstance(known[name], dict):
+            raise InputError(f"{truth}/truth.json: {name} is no JSON object; mend it")
     chambers = ("lv_endocardium", "rv_endocardium")
     if lacking := [name for name in chambers if name not in known["volumes_ml"]]:
         raise InputError(f"{truth}/truth.json: volumes_ml has no {', '.join(lacking)}; add them")
+    volumes = {f"volumes_ml.{name}": known["volumes_ml"][name] for name in chambers}
+    for name, value in {"phases": known["phases"], **volumes}.items():
+        _require_numbers(truth, name, value, 1)
+    _require_numbers(truth, "lv_mass_g", known["lv_mass_g"], 0)
+    if registered:
+        _require_matrix(truth, "mr_from_tracker", known["mr_from_tracker"])
     return known
+
+
+def _require_numbers(truth: Path, name: str, value: Any, axes: int) -> None:
+    """Refuse what is no array of finite numbers with so many axes."""
+    try:
+        numbers = np.asarray(value, float)
+        fit = numbers.ndim == axes and numbers.size > 0 and bool(np.isfinite(numbers).all())
+    except (TypeError, ValueError):
+        fit = False
+    if not fit:
+        words = ("a finite number", "a list of finite numbers", "rows of finite numbers")[axes]
+        raise InputError(f"{truth}/truth.json: {name} needs {words}; mend it, or take truth/ out")
+
+
+def _require_matrix(truth: Path, name: str, value: Any) -> None:
+    """Refuse what is no 4x4 matrix with an inverse."""
+    _require_numbers(truth, name, value, 2)
+    matrix = np.array(value, float)
+    if matrix.shape != (4, 4) or np.linalg.det(matrix) == 0:
+        raise InputError(
+            f"{truth}/truth.json: {name} is no 4x4 matrix with an inverse; mend it, or take truth/ "
+            "out"
+        )
 
 
 def _structures(
@@ -241,8 +275,15 @@ def _frame_phase_errors(job: Job, known: dict[str, Any]) -> Any:
                 f"{job.study.folder / 'truth' / 'truth.json'}: knows no sweep {row.sweep}, only "
                 f"{', '.join(known['us_frames'])}; give the files their names, or take truth/ out"
             )
-        nearest = int(np.abs(np.array(sweep["times_s"]) - row.time_s).argmin())
-        true = axis(sweep["mechanical_phases"][nearest])
+        told = sweep if isinstance(sweep, dict) else {}
+        times, phases = (told.get(one) or [] for one in ("times_s", "mechanical_phases"))
+        if not times or len(times) != len(phases):
+            raise InputError(
+                f"{job.study.folder / 'truth' / 'truth.json'}: us_frames.{row.sweep} needs times_s "
+                "and mechanical_phases, one of each a frame; mend it, or take truth/ out"
+            )
+        nearest = int(np.abs(np.array(times) - row.time_s).argmin())
+        true = axis(phases[nearest])
         errors.append(phase_error(np.array(row.phase), true))
     return np.array(errors)
 

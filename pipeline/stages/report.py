@@ -212,7 +212,8 @@ def _opening(job: Job, doubtful: int = 0) -> Opening:
     else:
         told.append("No known truth in this study: accuracy against truth was not measured.")
     if doubtful:
-        told.append(f"{doubtful} slices are of low confidence in some phase: see Segmentation.")
+        many = "1 slice is" if doubtful == 1 else f"{doubtful} slices are"
+        told.append(f"{many} of low confidence in some phase: see Segmentation.")
     told += [f"The heart was {text}." for text in reformatted(job.figures("segment"))]
     for text in cut_off_by(_cut_off(job, of_field=False), job.figures("ingest")):
         told.append(f"Cut off by the stack's end, and of no fixture: {text}.")
