@@ -1,9 +1,10 @@
-"""A cine without noise or faults, and which of its voxels hold one tissue alone."""
+"""Cines of the phantom: without noise or faults, which voxels hold one tissue, what labels miss."""
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
 from data_synth.mr import MrSettings
+from pipeline.imaging.cine import Cine
 
 CLEAN = MrSettings(
     phases=3,
@@ -28,6 +29,17 @@ QUICK = {"slices": 3, "slice_gap_mm": 20.0, "matrix": 64, "pixel_mm": 3.0}
 
 def changed(**changes: object) -> MrSettings:
     return MrSettings.model_validate({**CLEAN.model_dump(), **changes})
+
+
+def as_cine(made, count=None):
+    """As the pipeline reads it, a beat of 0.8 s; of the first ``count`` phases alone."""
+    phases = np.arange(len(made.intensity)) / len(made.intensity)
+    intensity = made.intensity[:count].astype(np.float32)
+    return Cine(intensity, made.mr_from_index, phases[:count], 0.8)
+
+
+def dice(found, truth):
+    return 2 * (found & truth).sum() / max(found.sum() + truth.sum(), 1)
 
 
 def tissue_map(heart, found, k, z, depth_mm=0.0):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry import Float, Mask, Surface
+from pipeline.surface.level_set import LevelSet, smooth_level_set
 
 SPACING_MM = 1.5
 
@@ -28,6 +29,13 @@ def voxel_noise_mm(spacing_mm: float, smoothing_voxels: float) -> float:
 def ellipsoid(axes_mm: tuple[float, float, float]) -> Implicit:
     """Negative inside, zero on the surface; not a distance."""
     return lambda points: np.linalg.norm(points / np.array(axes_mm), axis=-1) - 1
+
+
+def box(points_mm: Float, centre_mm: tuple[float, ...], half_mm: tuple[float, ...]) -> Float:
+    """Signed distance to a box."""
+    beyond = np.abs(points_mm - np.array(centre_mm)) - np.array(half_mm)
+    outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
+    return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0))
 
 
 def two_lobes(points_mm: Float) -> Float:
@@ -84,6 +92,12 @@ def voxel_centres(half_mm: tuple[float, float, float]) -> tuple[Float, Float]:
     first = np.array([-SPACING_MM * (n / 2 - 1 / 3) for n in counts])
     z, y, x = np.indices(counts[::-1])
     return first + SPACING_MM * np.stack([x, y, z], axis=-1), first
+
+
+def smooth_level(shape: Implicit, half_mm: tuple[float, float, float]) -> LevelSet:
+    """What labels of a shape about the origin become."""
+    points, _ = voxel_centres(half_mm)
+    return smooth_level_set(shape(points) < 0, SPACING_MM, 1.2)
 
 
 def crossing_triangles(surface: Surface) -> int:

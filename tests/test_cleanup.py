@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label
 
 from pipeline.imaging.cleanup import (
     _end_of_cavity,
     clean_cycle,
-    clean_probability,
     ventricle_tip,
 )
 
@@ -26,8 +25,15 @@ def ring(inner=14, outer=22):
     return np.where(inner > RADIUS, CAVITY, np.where(outer > RADIUS, MUSCLE, 0))
 
 
+def cleaned_chance(chance, pixel_mm=PIXEL_MM):
+    """One phase put right by itself."""
+    value = chance[None].copy()
+    clean_cycle(value, pixel_mm, STEP_MM)
+    return value[0]
+
+
 def cleaned(labels):
-    return clean_probability(one_hot(labels), pixel_mm=PIXEL_MM).argmax(axis=1)
+    return cleaned_chance(one_hot(labels)).argmax(axis=1)
 
 
 def test_a_heart_without_faults_is_left_as_it_is():
@@ -44,7 +50,7 @@ def test_what_is_less_probable_than_the_background_stays_beside_the_body():
     soft[:, 0] = np.where(RADIUS >= 14, 1 - chance, soft[:, 0])
     soft[:, [CAVITY, RV, ATRIUM, 5, 6]] *= RADIUS < 14
     soft /= soft.sum(axis=1, keepdims=True)
-    found = clean_probability(soft, pixel_mm=PIXEL_MM)
+    found = cleaned_chance(soft)
     np.testing.assert_allclose(found[:, :, RADIUS > 16], soft[:, :, RADIUS > 16], atol=1e-6)
 
 
@@ -66,7 +72,7 @@ def test_what_takes_over_from_an_island_may_be_no_island_either():
     soft[island] = 0.05 / 3
     for value, chance in zip((RV, right_atrium, MUSCLE, CAVITY), chances, strict=True):
         soft[:, value, 40:44, 58:62] = chance
-    found = clean_probability(soft, pixel_mm=PIXEL_MM).argmax(axis=1)
+    found = cleaned_chance(soft).argmax(axis=1)
     assert not np.isin(found[:, 40:44, 58:62], (RV, right_atrium, MUSCLE, CAVITY)).any()
     heart[:, 40:44, 58:62] = found[:, 40:44, 58:62]
     np.testing.assert_array_equal(found, heart)
@@ -227,7 +233,7 @@ def test_a_recess_walled_by_muscle_does_not_take_the_open_cavity_beside_it():
 def test_how_far_a_ventricle_may_widen_does_not_depend_on_the_pixels(finer):
     heart = np.stack([ring(7.7, 14), ring(6, 14), ring(8, 14), ring(10, 16)])
     heart = heart.repeat(finer, axis=1).repeat(finer, axis=2)
-    found = clean_probability(one_hot(heart), pixel_mm=PIXEL_MM / finer).argmax(axis=1)
+    found = cleaned_chance(one_hot(heart), PIXEL_MM / finer).argmax(axis=1)
     np.testing.assert_array_equal(found > 0, heart > 0)
     assert (found == CAVITY)[heart == CAVITY].all()
 
@@ -366,6 +372,76 @@ def test_where_nothing_is_left_there_is_background():
     heart = np.stack([ring()] * 3)
     heart[:, 2:8, 2:8] = ATRIUM
     sure = np.moveaxis(np.eye(7, dtype=np.float32)[heart], -1, -3)
-    found = clean_probability(sure, PIXEL_MM)
+    found = cleaned_chance(sure)
     np.testing.assert_array_equal(found[:, 0, 2:8, 2:8], 1)
     np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-6)
+
+
+def test_cleaning_removes_islands_and_fills_holes():
+    labels = np.zeros((3, 30, 30), int)
+    labels[:, 2:18, 2:18] = 2
+    labels[:, 7:13, 7:13] = 1
+    expected = labels.copy()
+    labels[1, 9, 9] = 0
+    labels[0, 26:28, 26:28] = 1
+    labels[2, 3, 3] = 1
+    found = cleaned(labels)
+    # What stands where something was ruled out is the next guess; here all others are equal.
+    assert found[1, 9, 9] != 0
+    assert not found[0, 20:, 20:].any()
+    assert found[2, 3, 3] != 1
+    untouched = labels == expected
+    np.testing.assert_array_equal(found[untouched], expected[untouched])
+
+
+def test_cleaning_keeps_a_part_whose_neck_is_too_thin_to_be_seen():
+    labels = np.zeros((5, 30, 30), int)
+    labels[:, 4:16, 4:16] = 4
+    labels[1:3, 8:14, 17:22] = 4
+    np.testing.assert_array_equal(cleaned(labels), labels)
+
+
+def test_cleaning_takes_a_bare_cavity_off_the_tip_but_not_off_the_base():
+    labels = np.zeros((5, 24, 24), int)
+    labels[1:4, 4:16, 4:16] = 2
+    labels[2:4, 7:13, 7:13] = 1
+    labels[[0, 4], 7:13, 7:13] = 1
+    found = cleaned(labels)
+    assert not (found[0] == 1).any()
+    np.testing.assert_array_equal(found[1:] == 1, labels[1:] == 1)
+
+
+def test_cleaning_takes_a_ventricle_off_that_leaps_in_size_below_the_tip():
+    labels = np.zeros((5, 40, 40), int)
+    for number, half in enumerate((14, 4, 7, 11, 15)):
+        labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 2
+        half = half // 2 if number else 11
+        labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 1
+    found = cleaned(labels)
+    assert not np.isin(found[0], (1, 2)).any()
+    np.testing.assert_array_equal(found[1:], labels[1:])
+
+
+def test_cleaning_keeps_probabilities_and_leaves_empty_images_alone():
+    chance = np.random.default_rng(0).dirichlet(np.ones(7), (2, 9, 9)).astype(np.float32)
+    found = cleaned_chance(np.moveaxis(chance, -1, 1))
+    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-5)
+    nothing = one_hot(np.zeros((2, 8, 8), int))
+    np.testing.assert_array_equal(cleaned_chance(nothing), nothing)
+
+
+@pytest.mark.parametrize(("neck", "joined"), [(0.4, True), (0.02, False)])
+def test_an_auricle_is_joined_along_a_likely_neck_and_no_other(neck, joined):
+    """A body and a finger of left atrium, four pixels of doubt between them."""
+    probability = np.zeros((5, 7, 40, 60), np.float32)
+    probability[:, 0] = 1.0
+    place = np.zeros((5, 40, 60), np.float32)
+    place[:, 10:30, 5:25] = place[1:4, 17:23, 29:45] = 0.95
+    place[2, 19:21, 25:29] = neck
+    probability[:, ATRIUM], probability[:, 0] = place, 1 - place
+
+    found = cleaned_chance(probability).argmax(axis=1) == ATRIUM
+
+    assert found[2, 20, 40] == joined
+    assert found[2, 20, 27] == joined
+    assert label(found, np.ones((3, 3, 3)))[1] == 1

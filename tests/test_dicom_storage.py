@@ -66,6 +66,13 @@ def test_lossless_jpeg_is_read_exactly_with_its_rescaling(tmp_path: Path) -> Non
         read_dicom_cine(tmp_path / "cine")
 
 
+def assert_padding_is_dark(folder: Path) -> None:
+    """In the second and third pixel; the first is the darkest one."""
+    expected = pixel_value(2, 1)
+    expected[0, 1:3] = expected[0, 0]
+    np.testing.assert_array_equal(read_dicom_cine(folder).cine.intensity[2, 1], expected)
+
+
 @pytest.mark.parametrize("white_for_black", [False, True])
 @pytest.mark.parametrize("limit", [None, -32760])
 def test_padding_is_as_dark_as_the_darkest_place(
@@ -84,11 +91,7 @@ def test_padding_is_as_dark_as_the_darkest_place(
         return True
 
     write_dicom(tmp_path, change)
-    found = read_dicom_cine(tmp_path).cine.intensity[2, 1]
-    expected = pixel_value(2, 1)
-    # The first pixel is the darkest one.
-    expected[0, 1:3] = expected[0, 0]
-    np.testing.assert_array_equal(found, expected)
+    assert_padding_is_dark(tmp_path)
 
 
 @pytest.mark.parametrize("implicit", [False, True])
@@ -211,11 +214,7 @@ def test_padding_told_with_the_other_sign_is_padding(
         return True
 
     write_dicom(tmp_path, change)
-    found = read_dicom_cine(tmp_path).cine.intensity[2, 1]
-    expected = pixel_value(2, 1)
-    # The first pixel is the darkest one.
-    expected[0, 1:3] = expected[0, 0]
-    np.testing.assert_array_equal(found, expected)
+    assert_padding_is_dark(tmp_path)
 
 
 def test_values_of_twelve_bits_may_be_stored_big_end_first(tmp_path: Path) -> None:

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 
 from pipeline.imaging.alignment import _observations, slice_shifts_mm
 from pipeline.imaging.interpolation import (
-    BAND_MM,
     REFINE,
     isotropic_labels,
     plane_depth_mm,
 )
 from pipeline.imaging.labels import LABELS
+from pipeline.imaging.tapering import BAND_MM
 
 PIXEL_MM = 1.5
 SIDE = 64

@@ -438,6 +438,14 @@ def test_the_place_of_agreement_is_the_likelihoods_mean() -> None:
     assert _place(np.roll(agreement, SEARCH_MM - 2, axis=0)) is None
 
 
+def drawn_stack_and_views(seed: int) -> Any:
+    """And the view of the stack, how slices are displaced in it, and their labels."""
+    cine, views, slices_mm, _ = stack_and_views(seed)
+    view = view_of(cine)
+    truth = in_view(view, slices_mm)
+    return cine, views, view, truth, drawn_on(view, truth)
+
+
 def in_plane_mm(*given: Any) -> Any:
     return slice_shifts_mm(*given)[:, :2]
 
@@ -446,10 +454,8 @@ def in_plane_mm(*given: Any) -> Any:
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 4))]
 )
 def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None:
-    cine, views, slices_mm, _ = stack_and_views(seed)
-    view = view_of(cine)
-    truth = in_view(view, slices_mm)
-    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    cine, views, view, truth, drawn = drawn_stack_and_views(seed)
+    heights_mm = 10.0 * np.arange(SLICES)
     smooth = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes)
     crossings = find_crossings(cine, views, view, drawn)
     seen = slice_shifts_mm(drawn, PIXEL_MM, heights_mm, view.axes, crossings)
@@ -465,10 +471,8 @@ def test_views_leave_less_of_the_shifts_than_smoothness_alone(seed: int) -> None
 
 @pytest.mark.parametrize("wrong", ["another body", "displaced"])
 def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
-    cine, views, slices_mm, _ = stack_and_views(2)
-    view = view_of(cine)
-    truth = in_view(view, slices_mm)
-    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    cine, views, view, truth, drawn = drawn_stack_and_views(2)
+    heights_mm = 10.0 * np.arange(SLICES)
     smooth = in_plane_mm(drawn, PIXEL_MM, heights_mm, view.axes)
     if wrong == "another body":
         off = stack_and_views(77)[1][0]
@@ -488,10 +492,8 @@ def test_a_view_that_is_wrong_is_voted_out(wrong: str) -> None:
 
 def test_a_view_that_contradicts_slices_and_views_is_left_out_of_the_equations() -> None:
     """Offsets of one view drift from slice to slice as those of no rigid view can."""
-    cine, views, slices_mm, _ = stack_and_views(3)
-    view = view_of(cine)
-    truth = in_view(view, slices_mm)
-    drawn, heights_mm = drawn_on(view, truth), 10.0 * np.arange(SLICES)
+    cine, views, view, _, drawn = drawn_stack_and_views(3)
+    heights_mm = 10.0 * np.arange(SLICES)
     good = find_crossings(cine, views, view, drawn)
     offsets_mm = good.offsets_mm.copy()
     third = np.array(good.views) == 2

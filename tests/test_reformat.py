@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mr_phantom import as_cine, dice
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -37,11 +38,6 @@ LEAN_DEG = 25.0
 """The heart's axis off where it was drawn, towards the level: so it lies in the stout."""
 
 
-def as_cine(made):
-    phases = np.arange(len(made.intensity)) / len(made.intensity)
-    return Cine(made.intensity.astype(np.float32), made.mr_from_index, phases, 0.8)
-
-
 def leaning_heart(seed):
     heart = draw_heart(np.random.default_rng(seed))
     across = np.cross(heart.long_axis, [0.0, 0.0, 1.0])
@@ -64,10 +60,6 @@ def angle_deg(one, other):
 
 def normal(cine):
     return canonical_axes(np.cross(cine.mr_from_index[:3, 0], cine.mr_from_index[:3, 1]))[2]
-
-
-def dice(found, truth):
-    return 2 * (found & truth).sum() / max(found.sum() + truth.sum(), 1)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from ellipsoid_heart import moving_surfaces, record, start_off, target_error_mm
+from mr_phantom import dice
 from scipy.ndimage import gaussian_filter
 
 from data_synth.training.ultrasound import pictures
@@ -31,10 +32,6 @@ def swept(images, pixel_mm=PIXEL_MM, name="sweep_000"):
     """A sweep of these pictures; the probe stands still."""
     transforms = np.tile(np.diag([pixel_mm, pixel_mm, 1.0, 1.0]), (len(images), 1, 1))
     return DisplacedSweep(name, np.asarray(images, np.float32), transforms)
-
-
-def dice(found, truth):
-    return 2 * (found & truth).sum() / (found.sum() + truth.sum())
 
 
 @pytest.fixture(scope="module")

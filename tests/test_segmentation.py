@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from mr_phantom import as_cine, dice
 from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
@@ -19,7 +20,6 @@ from data_synth.training import pool
 from pipeline.errors import InputError, StageError
 from pipeline.imaging import view
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cleanup import clean_probability
 from pipeline.imaging.labels import LABELS
 from pipeline.imaging.network import WEIGHTS, neighbour_steps, neighbours, normalise
 from pipeline.imaging.segmentation import segment_cine
@@ -38,9 +38,7 @@ def phantom(mr, seed=SEED):
     heart = draw_heart(rng)
     slices = count_slices(heart, mr)
     cine = acquire_cine(rng, heart, [800.0] * slices, mr)
-    phases = np.arange(mr.phases) / mr.phases
-    images = Cine(cine.intensity.astype(np.float32), cine.mr_from_index, phases, 0.8)
-    return heart, images, cine.labels
+    return heart, as_cine(cine), cine.labels
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +51,6 @@ def study():
 def of_two_phases(cine):
     """The fewest that a cine may have: for what is refused in whichever phase."""
     return replace(cine, intensity=cine.intensity[:2], phases=cine.phases[:2])
-
-
-def dice(found, truth):
-    return 2 * (found & truth).sum() / max(found.sum() + truth.sum(), 1)
 
 
 def points_on(vertices_mm, triangles, count=8000):
@@ -146,7 +140,6 @@ def test_labels_are_sure_on_the_phantom(study):
 
 
 def test_every_structure_is_one_body_in_the_volume_of_slices(study):
-    from scipy.ndimage import label
 
     for phase in study[3].labels:
         # On other pixels than the network's, a corner may come loose; a body may not.
@@ -335,83 +328,6 @@ def test_ends_of_the_stack_stand_in_for_missing_neighbours():
 
 def test_a_blank_image_normalises_to_zero():
     assert not normalise(np.full((8, 8), 7.0, np.float32)).any()
-
-
-def one_hot(labels):
-    return np.moveaxis(np.eye(7, dtype=np.float32)[labels], -1, 1) * 0.9 + 0.1 / 7
-
-
-def test_cleaning_removes_islands_and_fills_holes():
-    labels = np.zeros((3, 30, 30), int)
-    labels[:, 2:18, 2:18] = 2
-    labels[:, 7:13, 7:13] = 1
-    expected = labels.copy()
-    labels[1, 9, 9] = 0
-    labels[0, 26:28, 26:28] = 1
-    labels[2, 3, 3] = 1
-    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
-    # What stands where something was ruled out is the next guess; here all others are equal.
-    assert found[1, 9, 9] != 0
-    assert not found[0, 20:, 20:].any()
-    assert found[2, 3, 3] != 1
-    untouched = labels == expected
-    np.testing.assert_array_equal(found[untouched], expected[untouched])
-
-
-def test_cleaning_keeps_a_part_whose_neck_is_too_thin_to_be_seen():
-    labels = np.zeros((5, 30, 30), int)
-    labels[:, 4:16, 4:16] = 4
-    labels[1:3, 8:14, 17:22] = 4
-    np.testing.assert_array_equal(
-        clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1), labels
-    )
-
-
-def test_cleaning_takes_a_bare_cavity_off_the_tip_but_not_off_the_base():
-    labels = np.zeros((5, 24, 24), int)
-    labels[1:4, 4:16, 4:16] = 2
-    labels[2:4, 7:13, 7:13] = 1
-    labels[[0, 4], 7:13, 7:13] = 1
-    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
-    assert not (found[0] == 1).any()
-    np.testing.assert_array_equal(found[1:] == 1, labels[1:] == 1)
-
-
-def test_cleaning_takes_a_ventricle_off_that_leaps_in_size_below_the_tip():
-    labels = np.zeros((5, 40, 40), int)
-    for number, half in enumerate((14, 4, 7, 11, 15)):
-        labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 2
-        half = half // 2 if number else 11
-        labels[number, 20 - half : 20 + half, 20 - half : 20 + half] = 1
-    found = clean_probability(one_hot(labels), view.PIXEL_MM).argmax(axis=1)
-    assert not np.isin(found[0], (1, 2)).any()
-    np.testing.assert_array_equal(found[1:], labels[1:])
-
-
-def test_cleaning_keeps_probabilities_and_leaves_empty_images_alone():
-    chance = np.random.default_rng(0).dirichlet(np.ones(7), (2, 9, 9)).astype(np.float32)
-    cleaned = clean_probability(np.moveaxis(chance, -1, 1), view.PIXEL_MM)
-    np.testing.assert_allclose(cleaned.sum(axis=1), 1, atol=1e-5)
-    nothing = one_hot(np.zeros((2, 8, 8), int))
-    np.testing.assert_array_equal(clean_probability(nothing, view.PIXEL_MM), nothing)
-
-
-@pytest.mark.parametrize(("neck", "joined"), [(0.4, True), (0.02, False)])
-def test_an_auricle_is_joined_along_a_likely_neck_and_no_other(neck, joined):
-    """A body and a finger of left atrium, four pixels of doubt between them."""
-    atrium = LABELS["left_atrium"]
-    probability = np.zeros((5, 7, 40, 60), np.float32)
-    probability[:, 0] = 1.0
-    place = np.zeros((5, 40, 60), np.float32)
-    place[:, 10:30, 5:25] = place[1:4, 17:23, 29:45] = 0.95
-    place[2, 19:21, 25:29] = neck
-    probability[:, atrium], probability[:, 0] = place, 1 - place
-
-    found = clean_probability(probability, view.PIXEL_MM).argmax(axis=1) == atrium
-
-    assert found[2, 20, 40] == joined
-    assert found[2, 20, 27] == joined
-    assert label(found, np.ones((3, 3, 3)))[1] == 1
 
 
 @pytest.mark.parametrize(("off_deg", "first"), [(25, (1, 0, 0)), (10, (0, 1, 0))])

@@ -6,6 +6,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from mr_phantom import as_cine
 from scipy.ndimage import gaussian_filter
 from skimage.data import shepp_logan_phantom
 
@@ -45,10 +46,7 @@ def study():
         slices=SLICES,
     )  # fmt: skip
     cine = acquire_cine(rng, heart, [800.0] * SLICES, mr)
-    images = Cine(
-        cine.intensity[:2].astype(np.float32), cine.mr_from_index, np.array([0, 1 / 3]), 0.8
-    )
-    return images, cine.labels[:2]
+    return as_cine(cine, 2), cine.labels[:2]
 
 
 @pytest.fixture(scope="module")
@@ -366,11 +364,15 @@ def test_a_body_goes_on_by_the_share_that_its_last_cut_has_of_the_one_before(end
     assert cut_off(labels.astype(np.uint8)) == expected
 
 
-@pytest.mark.parametrize(("count", "step"), [(3, 2), (2, 4), (5, 2)])
-def test_a_slice_without_neighbours_is_not_unlike_them(count, step):
-    """Three slices 5 mm apart: those 9 mm away from the middle one are not there."""
-    heart = np.ones((2, count, 6, 6), bool)
-    np.testing.assert_array_equal(confidence._best_overlap_in_space(heart, step), 1)
+@pytest.mark.parametrize(("count", "step"), [(3, 2), (5, 2), (5, 3), (2, 2)])
+def test_a_slice_is_compared_with_the_closer_neighbour_if_it_has_any(count, step):
+    """Of three slices 5 mm apart, those 9 mm away from the middle one are not there."""
+    after = np.random.default_rng(0).random((2, count - step))
+    found = confidence._best_in_space(after, step)
+    for phase, number in np.ndindex(2, count):
+        # One after it, which is its own number in `after`, and one before it.
+        both = [one for one in (number, number - step) if 0 <= one < count - step]
+        assert found[phase, number] == max((after[phase, one] for one in both), default=-1)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mr_phantom import dice
 
 from pipeline.errors import StageError
 from pipeline.imaging.labels import LABELS
@@ -62,10 +63,6 @@ def people(request):
         found = segment_cine(replace(outside.cine, mr_from_index=frame), AS_USUAL)
         pairs.append((outside.labels, found.labels))
     return pairs
-
-
-def dice(found, truth):
-    return 2 * (found & truth).sum() / max(found.sum() + truth.sum(), 1)
 
 
 @pytest.mark.parametrize("name", REQUIRED)

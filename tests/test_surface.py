@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from surface_shapes import SPACING_MM, MovingBody, ellipsoid, voxel_centres, voxel_noise_mm
+from surface_shapes import SPACING_MM, MovingBody, box, ellipsoid, voxel_centres, voxel_noise_mm
 
 from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
@@ -175,14 +175,6 @@ def test_a_surface_that_lies_beside_labels_that_leap_is_told_with_its_phase(is_b
     assert SPACING_MM < found.off_mm["lv_endocardium"][3] < 7.5
 
 
-def slab(points: Float, centre_mm: tuple[float, ...], half_mm: tuple[float, ...]) -> Float:
-    """Signed distance to a box."""
-    beyond = np.abs(points - np.array(centre_mm)) - np.array(half_mm)
-    return np.asarray(
-        np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
-    )
-
-
 def test_a_slit_between_two_parts_is_plugged_for_the_mesh_too() -> None:
     """Two slabs 4 mm apart, held by two bars, turned two ways: their surface has no tunnel.
 
@@ -192,8 +184,8 @@ def test_a_slit_between_two_parts_is_plugged_for_the_mesh_too() -> None:
     points, _ = voxel_centres((36, 36, 36))
     for turn in Rotation.random(2, random_state=3):
         turned = points @ turn.as_matrix()
-        slabs = [slab(turned, (side * 10, 0, 0), (8, 18, 14)) for side in (-1, 1)]
-        bars = [slab(turned, (0, side * 14, 0), (10, 4, 10)) for side in (-1, 1)]
+        slabs = [box(turned, (side * 10, 0, 0), (8, 18, 14)) for side in (-1, 1)]
+        bars = [box(turned, (0, side * 14, 0), (10, 4, 10)) for side in (-1, 1)]
         parts = [
             Body((LevelSet(part.astype(np.float32), SPACING_MM),), (0.0,), (0.0,), np.zeros(3, int))
             for part in (slabs[0], np.minimum.reduce([slabs[1], *bars]))
@@ -203,7 +195,7 @@ def test_a_slit_between_two_parts_is_plugged_for_the_mesh_too() -> None:
         assert len(surface.vertices_mm) - len(surface.triangles) / 2 == 2
         assert _without_tunnels(level, 2.0) is level
         # Nothing is added beyond the slabs.
-        hull_mm = slab(turned, (0, 0, 0), (18, 18, 14))
+        hull_mm = box(turned, (0, 0, 0), (18, 18, 14))
         assert (hull_mm[level.distance_mm < 0] < SPACING_MM).all()
 
 

@@ -10,7 +10,7 @@ from field_shapes import flipped, sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from surface_shapes import crossing_triangles as independent
-from surface_shapes import ellipsoid, voxel_centres
+from surface_shapes import ellipsoid, smooth_level
 
 from pipeline.config import Settings
 from pipeline.errors import InputError
@@ -20,7 +20,7 @@ from pipeline.geometry import Float, Surface
 from pipeline.meshes import write_vtp
 from pipeline.own_surfaces import bake_own_surfaces
 from pipeline.surface.crossings import crossing_triangles
-from pipeline.surface.level_set import LevelSet, smooth_level_set
+from pipeline.surface.level_set import LevelSet
 from pipeline.surface.mesh import adjacency, extract_surface, uncrossed
 
 BESIDE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
@@ -29,8 +29,7 @@ TWO = np.array([[0, 1, 2], [3, 4, 5]])
 
 def thin_body() -> tuple[Surface, LevelSet]:
     """A lens 8 mm thick and 40 mm wide."""
-    points, _ = voxel_centres((30, 30, 14))
-    level = smooth_level_set(ellipsoid((20, 20, 4))(points) < 0, 1.5, 1.2)
+    level = smooth_level(ellipsoid((20, 20, 4)), (30, 30, 14))
     return extract_surface(level, 2.5), level
 
 

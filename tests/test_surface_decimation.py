@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from surface_shapes import ellipsoid, voxel_centres
+from surface_shapes import SPACING_MM, box, ellipsoid, smooth_level, voxel_centres
 
 from pipeline.evaluation.metrics import closedness, surface_samples
 from pipeline.geometry import MovingSurface
 from pipeline.surface.crossings import crossing_triangles
 from pipeline.surface.decimation import decimated, deviation_mm
-from pipeline.surface.level_set import LevelSet, smooth_level_set
+from pipeline.surface.level_set import LevelSet
 from pipeline.surface.measures import distances_mm, volumes_ml
 from pipeline.surface.mesh import bad_triangles, extract_surface
 
@@ -21,10 +21,8 @@ PHASES = np.array([0.0, 0.3, 0.6])
 def rounded_box() -> LevelSet:
     """A box with flat sides, 40 x 40 x 24 mm, and edges rounded to 5 mm."""
     points, _ = voxel_centres((30, 30, 24))
-    beyond = np.abs(points) - (15, 15, 7)
-    outside = np.linalg.norm(np.maximum(beyond, 0), axis=-1)
-    inside = np.minimum(beyond.max(axis=-1), 0)
-    return LevelSet((outside + inside - 5).astype(np.float32), 1.5)
+    distance_mm = box(points, (0, 0, 0), (15, 15, 7)) - 5
+    return LevelSet(distance_mm.astype(np.float32), SPACING_MM)
 
 
 def moving(level: LevelSet) -> MovingSurface:
@@ -107,7 +105,6 @@ def test_no_bound_is_no_decimation():
 
 def test_a_tight_bound_leaves_a_ball_alone():
     """Facets of edge 2 mm sag by e^2 / 12 R = 0.02 mm on a ball of 18 mm; 0.001 mm allow none."""
-    points, _ = voxel_centres((26, 26, 26))
-    ball = extract_surface(smooth_level_set(ellipsoid((18, 18, 18))(points) < 0, 1.5, 1.2), 2.0)
+    ball = extract_surface(smooth_level(ellipsoid((18, 18, 18)), (26, 26, 26)), 2.0)
     one = MovingSurface(ball.vertices_mm[None], ball.triangles, PHASES[:1])
     assert len(decimated(one, 0.001).triangles) > 0.95 * len(ball.triangles)

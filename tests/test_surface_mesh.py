@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import pyvista
 from field_shapes import flipped
-from surface_shapes import crossing_triangles, ellipsoid, two_lobes, voxel_centres
+from surface_shapes import crossing_triangles, ellipsoid, smooth_level, two_lobes, voxel_centres
 
 from pipeline.errors import InputError, StageError
 from pipeline.evaluation.metrics import closedness
 from pipeline.geometry import Surface
 from pipeline.meshes import read_mesh, write_vtp
-from pipeline.surface.level_set import LevelSet, smooth_level_set
+from pipeline.surface.level_set import LevelSet
 from pipeline.surface.mesh import (
     adjacency,
     bad_triangles,
@@ -41,8 +41,7 @@ TETRAHEDRON = Surface(
 
 
 def level_of(name: str) -> LevelSet:
-    points, _ = voxel_centres((40, 40, 46))
-    return smooth_level_set(SHAPES[name](points) < 0, 1.5, 1.2)
+    return smooth_level(SHAPES[name], (40, 40, 46))
 
 
 @pytest.mark.parametrize("name", SHAPES)

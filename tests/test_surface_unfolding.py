@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from surface_shapes import crossing_triangles as pierced
-from surface_shapes import two_lobes, voxel_centres
+from surface_shapes import smooth_level, two_lobes
 
 from pipeline.geometry import Float, Surface
 from pipeline.surface.crossings import crossing_triangles
-from pipeline.surface.level_set import smooth_level_set
 from pipeline.surface.mesh import bad_triangles, extract_surface
 from pipeline.surface.unfolding import make_unfolder
 
-POINTS, _ = voxel_centres((36, 30, 30))
-REST = extract_surface(smooth_level_set(two_lobes(POINTS) < 0, 1.5, 1.2), 2.5)
+REST = extract_surface(smooth_level(two_lobes, (36, 30, 30)), 2.5)
 UNFOLDER = make_unfolder(REST)
 LOW = REST.vertices_mm[:, 0].min()
 

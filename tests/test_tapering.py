@@ -9,7 +9,6 @@ from scipy.interpolate import CubicHermiteSpline
 
 from pipeline.imaging import interpolation
 from pipeline.imaging.interpolation import (
-    BAND_MM,
     REFINE,
     close_ends,
     isotropic_labels,
@@ -17,7 +16,7 @@ from pipeline.imaging.interpolation import (
     ventricle_depth_mm,
 )
 from pipeline.imaging.labels import LABELS
-from pipeline.imaging.tapering import taper_ventricle
+from pipeline.imaging.tapering import BAND_MM, taper_ventricle
 
 PIXEL_MM, SIDE, STEP_MM = 1.5, 72, 10.0
 PLANES = 3
@@ -173,7 +172,7 @@ def test_what_slices_show_stays_as_it_is(planes_a_slice):
         ]
     )
 
-    tapered_mm, tapered_height_mm = taper_ventricle(depth_mm, height_mm, slices, ventricle, BAND_MM)
+    tapered_mm, tapered_height_mm = taper_ventricle(depth_mm, height_mm, slices, ventricle)
 
     widest = slices[int(outside_mm.argmax())]
     kept = np.union1d(slices[outside_mm > 0], np.arange(widest, len(height_mm)))

@@ -16,6 +16,7 @@ from pipeline.imaging.frames import (
     MIN_SLICES,
     SEVERAL,
     Frame,
+    by_series,
     by_slice,
     is_stack,
     slice_positions,
@@ -194,10 +195,7 @@ def _doubts_of_rate(frames: Sequence[Frame]) -> tuple[str, ...]:
 
 def _doubts_of_series(frames: Sequence[Frame]) -> tuple[str, ...]:
     """A sentence where slices of one stack lie between those of another, as of rest and stress."""
-    series: dict[str, list[Frame]] = {}
-    for frame in frames:
-        series.setdefault(frame.series_uid, []).append(frame)
-    stacks = [(one, slice_positions(one)) for one in series.values() if is_stack(one)]
+    stacks = [(one, slice_positions(one)) for one in by_series(frames).values() if is_stack(one)]
     for (one, its_mm), (other, others_mm) in combinations(stacks, 2):
         if max(its_mm[0], others_mm[0]) < min(its_mm[-1], others_mm[-1]):
             return (

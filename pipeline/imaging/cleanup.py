@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.auricle import join_auricle
+from pipeline.imaging.depth import depth_px
 from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE, most_probable
 from pipeline.imaging.lookalikes import OPENINGS, part_from_right_heart, ventricle_cuts
 
@@ -56,9 +57,15 @@ STRAY_SHARE, BARE_SHARE = 0.3, 0.1
 def clean_cycle(value: Float32, pixel_mm: float, step_mm: float) -> None:
     """Put the anatomy of all phases right, in place.
 
-    Every phase is treated by `clean_probability`; the plane at which the left ventricle ends is
-    one for all phases, for its tip hardly moves while the base comes towards it. What falls apart
-    in a phase, and is one body before it and after it, is kept whole.
+    The heart is one body and so is each of its structures; what lies enclosed by the heart in a
+    plane belongs to it; the tip of the left ventricle is muscle; its cavity is drawn smooth, goes
+    on from plane to plane without leaps, lies by its muscle, and has muscle all around it where it
+    has muscle around most of it. Where a structure is ruled out, the next most probable class
+    takes over; there all sum to 1 again.
+
+    The plane at which the left ventricle ends is one for all phases, for its tip hardly moves while
+    the base comes towards it. What falls apart in a phase, and is one body before it and after it,
+    is kept whole.
 
     Parameters
     ----------
@@ -79,10 +86,9 @@ def clean_cycle(value: Float32, pixel_mm: float, step_mm: float) -> None:
         def clean(phase: int) -> None:
             held = _held(bodies, phase)
             parted = (held > 0) & (drawn[phase] == held) & (bodies[phase] != held)
-            largest = np.bincount(held[parted], minlength=1).max()
-            value[phase] = clean_probability(
-                value[phase], pixel_mm, tip, held if largest >= fewest else None
-            )
+            if np.bincount(held[parted], minlength=1).max() < fewest:
+                held[:] = 0
+            _clean_phase(value[phase], pixel_mm, tip, held)
 
         list(pool.map(clean, range(len(value))))
 
@@ -132,45 +138,24 @@ def ventricle_tip(value: Float32, pixel_mm: float) -> int:
     return 0
 
 
-def clean_probability(
-    probability: Float32, pixel_mm: float, tip: int | None = None, held: Label | None = None
-) -> Float32:
-    """Take probability from structures where anatomy rules them out.
-
-    The heart is one body and so is each of its structures; what lies enclosed by the heart in a
-    plane belongs to it; the tip of the left ventricle is muscle; its cavity is drawn smooth, goes
-    on from plane to plane without leaps, lies by its muscle, and has muscle all around it where it
-    has muscle around most of it.
-    Where a structure is ruled out, the next most probable class takes over.
+def _clean_phase(probability: Float32, pixel_mm: float, tip: int, held: Label) -> None:
+    """Take probability from structures where anatomy rules them out, in place.
 
     Parameters
     ----------
     probability
-        ``(plane, class, row, column)`` of one phase; class 0 is the background.
-    pixel_mm
-        Distance between rows and between columns.
+        ``(plane, class, row, column)``.
     tip
-        First plane that can hold the left ventricle (`ventricle_tip`); by default found from this
-        phase alone.
+        First plane that can hold the left ventricle (`ventricle_tip`).
     held
         ``(plane, row, column)`` where structures lie before and after this phase: pieces of theirs
         that lie there are no islands.
-
-    Returns
-    -------
-    array of the same shape
-        Sums to 1 over classes again wherever something was taken away.
     """
-    labels = most_probable(probability)
-    box = _bounding_box(labels)
-    if box is None:
-        return probability
-    if tip is None:
-        tip = ventricle_tip(probability[None], pixel_mm)
-    cleaned = probability.copy()
-    part = cleaned[:, :, box[1], box[2]]
-    held = np.zeros_like(labels) if held is None else held
-    held = held[:, box[1], box[2]]
+    found = ndimage.find_objects((most_probable(probability) > 0).view(np.uint8))
+    if not found:
+        return
+    _, rows, columns = found[0]
+    part, held = probability[:, :, rows, columns], held[:, rows, columns]
     join_auricle(part)
     part_from_right_heart(part, pixel_mm)
     labels = most_probable(part)
@@ -193,15 +178,6 @@ def clean_probability(
     # All classes ruled out: background is what is left.
     part[:, 0] = np.where(total[:, 0] > 1e-6, part[:, 0], 1)
     part /= np.maximum(part.sum(axis=1, keepdims=True), 1e-6)
-    return cleaned
-
-
-def _bounding_box(labels: Label) -> tuple[slice, slice, slice] | None:
-    found = ndimage.find_objects((labels > 0).astype(np.uint8))
-    if not found:
-        return None
-    planes, rows, columns = found[0]
-    return planes, rows, columns
 
 
 def _largest_body(mask: Mask, held: Mask | None = None) -> Mask:
@@ -371,10 +347,7 @@ def _smooth_cavity(part: Float32, pixel_mm: float) -> None:
             room:-room, room:-room
         ]
         ventricle = np.pad((plane == CAVITY) | (plane == MUSCLE), 1)
-        to_outside = cv2.distanceTransform(
-            ventricle.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-        )[1:-1, 1:-1]
-        deep = to_outside * pixel_mm > LEAST_WALL_MM
+        deep = depth_px(ventricle)[1:-1, 1:-1] * pixel_mm > LEAST_WALL_MM
         _hand_over(part[number], (closed > 0) & (plane == MUSCLE) & deep, CAVITY)
 
 

@@ -72,14 +72,16 @@ def slice_confidence(cine: Cine, found: PlaneProbability, drawn: Label) -> Float
     step = neighbour_steps(found.view.slice_step_mm)
     if step * found.view.slice_step_mm > FARTHEST_MM or step >= confidence.shape[1]:
         return confidence
-    alike = _ramp(_best_in_space(images, step), ALIKE_IN_SPACE)
+    after = (images[:, step:] * images[:, :-step]).sum(axis=2)
+    alike = _ramp(_best_in_space(after, step), ALIKE_IN_SPACE)
     # At an end there is one neighbour alone, and a slice that grazes the tip resembles nothing.
     number = np.arange(alike.shape[1])
     end = (number < step) | (number >= len(number) - step)
     alike[:, end] = (1 + alike[:, end]) / 2
     confidence *= alike
-    overlap = _best_overlap_in_space(heart, step)
-    return np.asarray(confidence * np.where(large, _ramp(overlap, OVERLAP), 1))
+    overlap = _best_in_space(_dice(heart[:, step:], heart[:, :-step]), step)
+    known = large & (overlap >= 0)
+    return np.asarray(confidence * np.where(known, _ramp(overlap, OVERLAP), 1))
 
 
 def _without_strays(heart: Mask) -> Mask:
@@ -169,24 +171,14 @@ def _best_in_time(images: Float32) -> Float:
     return np.asarray(np.maximum(after, np.roll(after, 1, axis=0)), float)
 
 
-def _best_in_space(images: Float32, step: int) -> Float:
-    """Correlation with the slice ``step`` before or after, whichever is closer."""
-    best = np.full(images.shape[:2], -1.0)
-    after = (images[:, step:] * images[:, :-step]).sum(axis=2)
-    best[:, :-step] = after
-    best[:, step:] = np.maximum(best[:, step:], after)
-    return best
+def _best_in_space(after: Float | Float32, step: int) -> Float:
+    """Likeness ``(phase, slice)`` to the slice ``step`` before or after, whichever is closer; -1
+    where there is neither.
 
-
-def _best_overlap_in_space(heart: Mask, step: int) -> Float:
-    """Dice with the slice ``step`` before or after, the larger; 1 where there is neither."""
-    best = np.zeros(heart.shape[:2])
-    count = heart.shape[1]
-    best[:, max(count - step, 0) : step] = 1
-    after = _dice(heart[:, step:], heart[:, :-step])
-    best[:, :-step] = after
-    best[:, step:] = np.maximum(best[:, step:], after)
-    return best
+    ``after`` is that of each slice which has one to the slice ``step`` after it.
+    """
+    both = np.pad(after, ((0, 0), (step, step)), constant_values=-1)
+    return np.asarray(np.maximum(both[:, :-step], both[:, step:]), float)
 
 
 def _dice(one: Mask, other: Mask) -> Float:

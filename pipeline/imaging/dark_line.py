@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import THREADS
+from pipeline.imaging.depth import depth_px
 from pipeline.imaging.inference import PlaneProbability, darkest_grey, sampled_slice
-from pipeline.imaging.interpolation import ventricle_margin
+from pipeline.imaging.interpolation import around, ventricle_margin
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
 
 INSIDE_PX, OUTSIDE_PX, STEP_PX = 2.0, 0.5, 0.25
@@ -62,17 +63,15 @@ def end_at_dark_line(found: PlaneProbability, cine: Cine) -> None:
     """
     own_mm = float(np.linalg.norm(cine.mr_from_index[:3, :2], axis=0).max())
     pixel_px = max(own_mm / found.view.pixel_mm, 1.0)
-    slices, count = len(found.view.order), found.planes_a_slice
     nothing = darkest_grey(cine.intensity)
 
     def one(place: tuple[int, int]) -> None:
         phase, number = place
-        planes = found.value[phase, number * count : (number + 1) * count]
         image = sampled_slice(cine, found.view, phase, number) - nothing
-        _move_planes(planes, image, pixel_px, found.view.pixel_mm)
+        _move_planes(found.of_slice(phase, number), image, pixel_px, found.view.pixel_mm)
 
     with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(one, np.ndindex(len(found.value), slices)))
+        list(pool.map(one, np.ndindex(len(found.value), len(found.view.order))))
 
 
 class _Outline(NamedTuple):
@@ -87,7 +86,8 @@ class _Outline(NamedTuple):
 
 def _move_planes(planes: Float32, image: Float32, pixel_px: float, pixel_mm: float) -> None:
     """Move the outside on a slice's planes ``(plane, class, row, column)``, in place."""
-    rows, columns = _around(most_probable(planes[len(planes) // 2], axis=0))
+    body = np.isin(most_probable(planes[len(planes) // 2], axis=0), (CAVITY, MUSCLE))
+    rows, columns = around(body, MARGIN_PX)
     planes, image = planes[:, :, rows, columns], image[rows, columns]
     probability = planes[len(planes) // 2]
     labels = most_probable(probability, axis=0)
@@ -102,17 +102,6 @@ def _move_planes(planes: Float32, image: Float32, pixel_px: float, pixel_mm: flo
     moves = (move_px[:, None] * outline.outwards).astype(np.float32)
     for plane in planes:
         _move_plane(plane, tree, moves, pixel_mm)
-
-
-def _around(labels: Label) -> tuple[slice, slice]:
-    """Rows and columns that hold the left ventricle and what may move about it."""
-    body = np.isin(labels, (CAVITY, MUSCLE))
-    cut = []
-    for axis in (1, 0):
-        found = np.flatnonzero(body.any(axis=axis))
-        ends = (int(found[0]), int(found[-1])) if len(found) else (0, 0)
-        cut.append(slice(max(0, ends[0] - MARGIN_PX), ends[1] + MARGIN_PX + 1))
-    return cut[0], cut[1]
 
 
 def _outline(probability: Float32, labels: Label) -> _Outline | None:
@@ -214,13 +203,8 @@ def _move_plane(plane: Float32, tree: cKDTree, moves: Float32, pixel_mm: float) 
 
 def _share_moved(body: Mask, still: Mask, pixel_mm: float) -> Float32:
     """By which share of the outline's own move each pixel moves: all near it, ``still`` none."""
-
-    def away_mm(mask: Mask) -> Float32:
-        distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        return np.asarray(distance * pixel_mm)
-
-    from_outline_mm = np.where(body, away_mm(body), away_mm(~body)) - pixel_mm / 2
+    from_outline_mm = np.where(body, depth_px(body), depth_px(~body)) * pixel_mm - pixel_mm / 2
     share = np.clip((NONE_MM - from_outline_mm) / (NONE_MM - WHOLE_MM), 0, 1)
     if still.any():
-        share *= np.clip(away_mm(~still) / pixel_mm - 0.5, 0, 1)
+        share *= np.clip(depth_px(~still) - 0.5, 0, 1)
     return np.asarray(share, np.float32)

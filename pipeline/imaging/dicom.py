@@ -198,27 +198,25 @@ def _is_directory(dataset: Any) -> bool:
 def _other_object(dataset: Any) -> str | None:
     """What the object is, when it is known to be something else than an image of a slice."""
     sop_class = str(dataset.get("SOPClassUID", "") or MR_IMAGE)
+    magnetic = sop_class in MR_CLASSES
     name = MR_CLASSES.get(sop_class) or pydicom.uid.UID(sop_class).name
     if "PixelData" not in dataset:
-        return None if sop_class in MR_CLASSES else f"{name}, no image"
+        return None if magnetic else f"{name}, no image"
     # OT is what programs call images that they convert, of any origin.
     modality = str(dataset.get("Modality", "") or "MR")
-    if modality not in ("MR", "OT") and sop_class not in MR_CLASSES:
+    if modality not in ("MR", "OT") and not magnetic:
         return f"{name}, of modality {modality}"
     if int(dataset.get("SamplesPerPixel", 1) or 1) != 1:
         return f"{name}, in colour"
-    magnetic = sop_class in MR_CLASSES
     # Programs that make files anonymous may leave the attribute, and empty it.
     placed = bool(dataset.get("ImagePositionPatient"))
     placed = placed and (magnetic or bool(dataset.get("PixelSpacing")))
-    placed = placed or (
-        "PerFrameFunctionalGroupsSequence" in dataset and (magnetic or _tells_planes(dataset))
-    )
-    together = int(dataset.get("NumberOfFrames", 1) or 1)
-    if together > 1 and "PerFrameFunctionalGroupsSequence" not in dataset:
+    if "PerFrameFunctionalGroupsSequence" in dataset:
+        placed = placed or magnetic or _tells_planes(dataset)
+    elif int(dataset.get("NumberOfFrames", 1) or 1) > 1:
         placed = False
     # An original MR image without a place may be one of the cine's, spoilt by an export.
-    doubtful = sop_class in MR_CLASSES and _kind(dataset, pydicom.Dataset()) != DERIVED
+    doubtful = magnetic and _kind(dataset, pydicom.Dataset()) != DERIVED
     return None if placed or doubtful else f"{name}, without a place in space"
 
 

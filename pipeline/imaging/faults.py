@@ -15,7 +15,7 @@ from pipeline.imaging.cine import Cine, Stack
 from pipeline.imaging.dicom_pixels import at_the_edge
 from pipeline.imaging.frames import MIN_SLICES
 from pipeline.imaging.spacing import WIDEST_GAP_MM
-from pipeline.imaging.stored_order import small_images
+from pipeline.imaging.stored_order import of_one_contrast, small_images
 
 MOST_BRIGHTEST = 0.05
 """Share of pixels that may have the largest value of their image: of what was measured few have."""
@@ -77,9 +77,7 @@ def require_slices_before_phases(cine: Cine, where: str) -> None:
     """
     if min(cine.intensity.shape[:2]) < MIN_SLICES:
         return
-    images = small_images(cine)
-    images -= images.mean(axis=2, keepdims=True)
-    images /= np.maximum(np.linalg.norm(images, axis=2, keepdims=True), 1e-9)
+    images = of_one_contrast(small_images(cine))
     by_phase, by_slice = (_unlike_next(np.moveaxis(images, axis, 0)) for axis in (0, 1))
     phases, slices = (float(one[:-1].mean()) for one in (by_phase, by_slice))
     if (

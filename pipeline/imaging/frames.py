@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,26 +100,31 @@ class Frame:
 
 def slice_positions(frames: Sequence[Frame]) -> Float:
     """Where the slices lie along the first frame's normal, rising, in mm."""
-    along_mm = np.sort(_along_normal_mm(frames))
+    along_mm = np.sort(places_along_mm(frames, frames[0].normal))
     return np.asarray(along_mm[np.diff(along_mm, prepend=-np.inf) > NEAREST_SLICES_MM])
 
 
-def _along_normal_mm(frames: Sequence[Frame]) -> list[float]:
-    """Where each frame lies along the first one's normal."""
-    normal = frames[0].normal
-    return [float(frame.middle_mm @ normal) for frame in frames]
+def places_along_mm(frames: Sequence[Frame], normal: Float) -> Float:
+    """Where each frame ``(n,)`` lies along a normal."""
+    return np.array([frame.middle_mm @ normal for frame in frames], float)
 
 
 def sets_alike(frames: Sequence[Frame]) -> list[list[Frame]]:
     """Sets of images that could be stacked: same pixel axes, matrix, spacing and kind."""
+    return grouped(
+        frames, lambda first, frame: first.kind == frame.kind and fit_each_other(first, frame)
+    )
+
+
+def grouped(frames: Iterable[Frame], belongs: Callable[[Frame, Frame], bool]) -> list[list[Frame]]:
+    """Each frame with the first set to whose first frame it belongs, or in one of its own."""
     sets: list[list[Frame]] = []
     for frame in frames:
-        for one in sets:
-            if one[0].kind == frame.kind and fit_each_other(one[0], frame):
-                one.append(frame)
-                break
-        else:
+        own = next((one for one in sets if belongs(one[0], frame)), None)
+        if own is None:
             sets.append([frame])
+        else:
+            own.append(frame)
     return sets
 
 
@@ -147,9 +152,17 @@ def by_slice(frames: Sequence[Frame]) -> list[list[Frame]]:
     # Half the least distance of two slices: rounded positions fall on the right side.
     starts_mm = slice_positions(frames) - NEAREST_SLICES_MM / 2
     slices: list[list[Frame]] = [[] for _ in starts_mm]
-    for frame, along_mm in zip(frames, _along_normal_mm(frames), strict=True):
+    for frame, along_mm in zip(frames, places_along_mm(frames, frames[0].normal), strict=True):
         slices[int(np.searchsorted(starts_mm, along_mm)) - 1].append(frame)
     return slices
+
+
+def by_series(frames: Iterable[Frame]) -> dict[str, list[Frame]]:
+    """The frames of each series, by what tells it apart."""
+    series: dict[str, list[Frame]] = {}
+    for frame in frames:
+        series.setdefault(frame.series_uid, []).append(frame)
+    return series
 
 
 def count_moments(frames: Sequence[Frame]) -> list[int]:

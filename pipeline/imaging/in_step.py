@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.geometry import Float, Label
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import CAVITY, MUSCLE
 
 LEAST_CAVITY, LEAST_MUSCLE = 0.2, 0.25
 """Of the largest slice's area, in each phase: what has less is near the tip or the valves, where
@@ -66,8 +66,7 @@ def out_of_step(labels: Label, phases: Float, pixel_mm: float) -> dict[int, dict
         others.
     """
     cavity, muscle = (
-        (labels == LABELS[name]).sum(axis=(2, 3)).astype(float)
-        for name in ("lv_cavity", "lv_myocardium")
+        (labels == value).sum(axis=(2, 3)).astype(float) for value in (CAVITY, MUSCLE)
     )
     whole = (cavity.min(axis=0) > LEAST_CAVITY * cavity.max()) & (
         muscle.min(axis=0) > LEAST_MUSCLE * muscle.max()

@@ -9,10 +9,10 @@ from itertools import product
 import cv2
 import numpy as np
 
-from pipeline.geometry import Float, Float32
+from pipeline.geometry import Float, Float32, Label
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.flicker import doubted_planes
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.network import (
     CLASSES,
     PLANES,
@@ -23,6 +23,7 @@ from pipeline.imaging.network import (
     predict,
     side_by_side,
 )
+from pipeline.imaging.phases import around_phases
 from pipeline.imaging.view import View
 from pipeline.progress import Progress
 
@@ -82,6 +83,18 @@ class PlaneProbability:
         """Probabilities on the slices themselves, ``(slice, class, row, column)``."""
         middle = self.planes_a_slice // 2
         return self.value[phase, middle :: self.planes_a_slice]
+
+    def of_slice(self, phase: int, number: int) -> Float32:
+        """Probabilities on the planes of a slice, ``(plane, class, row, column)``, to be changed.
+
+        ``number`` counts slices from the apex.
+        """
+        first = number * self.planes_a_slice
+        return self.value[phase, first : first + self.planes_a_slice]
+
+    def drawn(self) -> Label:
+        """Most probable labels on the slices, ``(phase, slice, row, column)``."""
+        return np.stack([most_probable(self.at_slices(k)) for k in range(len(self.value))])
 
 
 def darkest_grey(intensity: Float32) -> np.float32:
@@ -292,14 +305,13 @@ def bring_to_one_axis(found: PlaneProbability, cine: Cine) -> bool:
     -------
     Whether any was moved.
     """
-    phases, moved = cine.phases, False
     if cine.moments is None:
-        return moved
-    for number, z in enumerate(found.view.order):
-        first = number * found.planes_a_slice
-        for plane in range(first, first + found.planes_a_slice):
-            moved |= move_in_time(found.value[:, plane], cine.moments[z], phases)
-    return moved
+        return False
+    seen = np.repeat(cine.moments[list(found.view.order)], found.planes_a_slice, axis=0)
+    moved = [
+        move_in_time(found.value[:, plane], one, cine.phases) for plane, one in enumerate(seen)
+    ]
+    return any(moved)
 
 
 def move_in_time(value: Float32, seen: Float, phases: Float) -> bool:
@@ -309,14 +321,11 @@ def move_in_time(value: Float32, seen: Float, phases: Float) -> bool:
     """
     if np.abs(seen - phases).max() <= ONE_MOMENT or (np.diff(seen) <= 0).any():
         return False
-    count, times = len(seen), np.append(seen, seen[0] + 1)
-    place = np.interp((phases - seen[0]) % 1 + seen[0], times, np.arange(count + 1))
-    low = np.floor(place).astype(int) % count
-    beside_gap = np.diff(times)[low] > GAP
-    share = (place % 1).astype(np.float32)
+    low, high, share = around_phases(phases, seen)
+    beside_gap = np.diff(seen, append=seen[0] + 1)[low] > GAP
     before = value.copy()
     for phase in np.flatnonzero(~beside_gap):
-        one, other = before[low[phase]], before[(low[phase] + 1) % count]
+        one, other = before[low[phase]], before[high[phase]]
         value[phase] = one + share[phase] * (other - one)
     return True
 

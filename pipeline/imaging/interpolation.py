@@ -13,15 +13,11 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 
-from pipeline.geometry import Float, Float32, Label
+from pipeline.geometry import Float, Float32, Label, Mask
 from pipeline.imaging.cleanup import THREADS
+from pipeline.imaging.depth import depth_px
 from pipeline.imaging.labels import CAVITY, MUSCLE, most_probable
-from pipeline.imaging.tapering import LID_MM, taper_ventricle
-
-BAND_MM = 4.0
-"""Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
-slope still be followed; the seam between two structures that end against each other is notched
-by a third of this at its rim."""
+from pipeline.imaging.tapering import BAND_MM, LID_MM, taper_ventricle
 
 TAPER_MM = 10.0
 """How a structure tapers towards an end of the stack is told by its areas this near to it."""
@@ -66,7 +62,7 @@ def isotropic_labels(
         How far beyond the outer planes the heart reaches at the most. Half a step beyond the
         outer slice is what volumes summed slice by slice assume.
     grid_mm, margin_mm
-        Spacing of the grid, and the empty space around the heart.
+        Spacing of the grid, and the empty space around the heart; in the planes as far as there is.
     planes_a_slice
         The middle one of so many planes is a slice.
 
@@ -96,15 +92,15 @@ def isotropic_labels(
         )
         added = int(np.searchsorted(closed_plane_mm, plane_mm[0]))
         tapered_mm, tapered_plane_mm = taper_ventricle(
-            closed_mm, closed_plane_mm, slices + added, ventricle_mm, BAND_MM
+            closed_mm, closed_plane_mm, slices + added, ventricle_mm
         )
         return interpolate_planes(tapered_mm, tapered_plane_mm, height_mm)
 
     with ThreadPoolExecutor(THREADS) as pool:
         volume = np.stack(list(pool.map(labels, probability[:, :, :, cut[0], cut[1]])))
-    first, last = _heights_with_heart(volume, round(margin_mm / grid_mm))
-    first_mm = np.array([cut[1].start * pixel_mm, cut[0].start * pixel_mm, height_mm[first]])
-    return np.ascontiguousarray(volume[:, first:last]), first_mm
+    volume, first = _with_margin(volume, round(margin_mm / grid_mm))
+    lowest_mm = height_mm[max(first, 0)] + min(first, 0) * grid_mm
+    return volume, np.array([cut[1].start * pixel_mm, cut[0].start * pixel_mm, lowest_mm])
 
 
 def _cut_around(probability: Float32, margin_mm: float, pixel_mm: float) -> tuple[slice, slice]:
@@ -112,20 +108,37 @@ def _cut_around(probability: Float32, margin_mm: float, pixel_mm: float) -> tupl
     likely = np.zeros(probability.shape[3:], bool)
     for one in probability:
         likely |= (one[:, 0] < 0.5).any(axis=0)
-    margin = round(margin_mm / pixel_mm)
+    return around(likely, round(margin_mm / pixel_mm))
+
+
+def around(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """Rows and columns that hold a mask and a margin, as far as there is one; all, of an empty one.
+
+    Parameters
+    ----------
+    mask
+        ``(row, column)``.
+    margin
+        Pixels.
+    """
     cut = []
     for axis in (1, 0):
-        found = np.flatnonzero(likely.any(axis=axis))
-        ends = (found[0], found[-1]) if len(found) else (0, likely.shape[1 - axis] - 1)
+        found = np.flatnonzero(mask.any(axis=axis))
+        ends = (found[0], found[-1]) if len(found) else (0, mask.shape[1 - axis] - 1)
         cut.append(slice(max(0, int(ends[0]) - margin), int(ends[1]) + margin + 1))
     return cut[0], cut[1]
 
 
-def _heights_with_heart(volume: Label, margin: int) -> tuple[int, int]:
+def _with_margin(volume: Label, margin: int) -> tuple[Label, int]:
+    """Planes cut off or empty ones added, so that ``margin`` lie on either side of the heart; and
+    which of the volume's is the first, below 0 where planes were added before them."""
     found = np.flatnonzero(volume.any(axis=(0, 2, 3)))
     if not len(found):
-        return 0, volume.shape[1]
-    return max(0, int(found[0]) - margin), int(found[-1]) + margin + 1
+        return volume, 0
+    first, beyond = int(found[0]) - margin, int(found[-1]) + margin + 1
+    added = max(-first, 0), max(beyond - volume.shape[1], 0)
+    inside = volume[:, max(first, 0) : beyond]
+    return np.pad(inside, ((0, 0), added, (0, 0), (0, 0))), first
 
 
 def plane_depth_mm(
@@ -210,11 +223,9 @@ def _magnified(
 
 def _signed_depth_mm(fine: Float32, grid_mm: float) -> Float32:
     """Distance to the zero contour of values on the fine points, at grid points; + inside."""
-    inside = (fine > 0).astype(np.uint8)
-    within = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beyond = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inside = fine > 0
     # Distances run to the nearest point of the other side; the outline lies half a step before.
-    signed = np.where(inside > 0, within - 0.5, 0.5 - beyond).astype(np.float32)
+    signed = np.where(inside, depth_px(inside) - 0.5, 0.5 - depth_px(~inside)).astype(np.float32)
     size = (fine.shape[1] // REFINE, fine.shape[0] // REFINE)
     coarse, margin = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (signed, fine))
     return np.asarray(coarse * np.float32(grid_mm / REFINE) + TIE_MM * margin)

@@ -12,7 +12,7 @@ from pipeline.errors import StageError
 from pipeline.geometry import Float32, Label, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.inference import network_images
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import CAVITY, MUSCLE
 from pipeline.imaging.network import MULTIPLE, PLANES, WINDOW, predict
 from pipeline.imaging.orientation import Look, find_orientation
 from pipeline.imaging.view import AS_THE_FILE_SAYS, PIXEL_MM, Orientation, View, view_of
@@ -148,8 +148,7 @@ def _seen_in_field(
 
 def in_a_ring(labels: Label) -> Mask:
     """Left ventricle's cavity where its muscle encloses it, on one slice."""
-    muscle = labels == LABELS["lv_myocardium"]
-    return np.asarray(ndimage.binary_fill_holes(muscle) & (labels == LABELS["lv_cavity"]))
+    return np.asarray(ndimage.binary_fill_holes(labels == MUSCLE) & (labels == CAVITY))
 
 
 def _look_about(cine: Cine, place: View) -> Look:

@@ -20,6 +20,7 @@ from scipy.ndimage import map_coordinates, uniform_filter1d
 
 from pipeline.geometry import Float, Float32, Integer, Label, Mask, transform_points
 from pipeline.imaging.cine import Cine
+from pipeline.imaging.phases import around_phases
 from pipeline.imaging.view import View
 from pipeline.registration.clock import to_cycle
 
@@ -216,13 +217,9 @@ def _profiles(other: Cine, line: _Line, phases: Float) -> Float:
 
 def _at_phases(other: Cine, phases: Float) -> Float32:
     """Images ``(phase, row, column)`` of a view between its own phases, which are cyclic."""
-    count = len(other.phases)
-    times = np.concatenate([other.phases, [other.phases[0] + 1]])
-    place = np.interp((phases - times[0]) % 1 + times[0], times, np.arange(count + 1))
-    low = np.floor(place).astype(int)
-    share = (place - low).astype(np.float32)[:, None, None]
-    images = other.intensity[:, 0]
-    return np.asarray((1 - share) * images[low % count] + share * images[(low + 1) % count])
+    low, high, share = around_phases(phases, other.phases)
+    share, images = share[:, None, None], other.intensity[:, 0]
+    return np.asarray((1 - share) * images[low] + share * images[high])
 
 
 def _slice_patches(cine: Cine, line: _Line, z: int, chosen: Integer) -> Float:

@@ -18,7 +18,10 @@ from pipeline.imaging.frames import (
     ORIGINAL,
     PARALLEL_COSINE,
     Frame,
+    by_series,
     count_moments,
+    grouped,
+    time_ranges_ms,
 )
 from pipeline.imaging.phases import PLAUSIBLE_RR_S
 
@@ -58,40 +61,34 @@ def long_axis_views(
     along = [frame for frame in frames if _cosine(frame, normal) > PARALLEL_COSINE]
     reference = _most(frame.frame_of_reference for frame in along)
     examination = _most(frame.study for frame in along)
-    slices: list[list[Frame]] = []
-    elsewhere: list[Frame] = []
-    others: list[Frame] = []
-    for frame in sorted(frames, key=lambda one: one.where):
-        across = _cosine(frame, normal) < np.cos(np.radians(LEAST_ANGLE_DEG))
-        if not across:
-            continue
-        if frame.kind != ORIGINAL:
-            others.append(frame)
-            continue
-        told = frame.frame_of_reference
-        if told not in ("", reference) or (not told and frame.study not in ("", examination)):
-            elsewhere.append(frame)
-            continue
-        of_its_slice = next((one for one in slices if _same_slice(one[0], frame)), None)
-        if of_its_slice is None:
-            slices.append([frame])
-        else:
-            of_its_slice.append(frame)
-    found = [_views(one) for one in slices]
+
+    def is_elsewhere(frame: Frame) -> bool:
+        if frame.frame_of_reference:
+            return frame.frame_of_reference != reference
+        return frame.study not in ("", examination)
+
+    farthest = np.cos(np.radians(LEAST_ANGLE_DEG))
+    across = [frame for frame in frames if _cosine(frame, normal) < farthest]
+    across.sort(key=lambda one: one.where)
+    original = [frame for frame in across if frame.kind == ORIGINAL]
+    found = [
+        _views(one)
+        for one in grouped((one for one in original if not is_elsewhere(one)), _same_slice)
+    ]
     views = tuple(view for some, _ in found for view in some)
     reasons = [reason for _, some in found for reason in some]
     # A series may hold velocities beside original images, which are a view, or told of themselves.
-    seen = {frame.series_uid for one in [*slices, elsewhere] for frame in one}
+    seen = {frame.series_uid for frame in original}
     reasons += [
         f"{one[0].series}: no long-axis view: its images are {one[0].kind}, and no original ones"
-        for one in _by_series(others)
+        for one in by_series(frame for frame in across if frame.kind != ORIGINAL).values()
         if max(count_moments(one)) >= MIN_PHASES and one[0].series_uid not in seen
     ]
     reasons += [
         f"{one[0].series}: no long-axis view: it has another FrameOfReferenceUID than the stack, "
         "or none and another StudyInstanceUID, as of a patient laid down anew; if a program that "
         "makes files anonymous did that, let it keep one for all"
-        for one in _by_series(elsewhere)
+        for one in by_series(filter(is_elsewhere, original)).values()
         if len(one) >= MIN_PHASES
     ]
     return views, tuple(reasons)
@@ -116,13 +113,6 @@ def _same_slice(first: Frame, frame: Frame) -> bool:
     )
 
 
-def _by_series(frames: Iterable[Frame]) -> list[list[Frame]]:
-    by_series: dict[str, list[Frame]] = {}
-    for frame in frames:
-        by_series.setdefault(frame.series_uid, []).append(frame)
-    return list(by_series.values())
-
-
 def _views(frames: Sequence[Frame]) -> tuple[list[LongAxis], list[str]]:
     """What the images of one slice make up: a view a series, or one where these are its parts; and
     why series are none.
@@ -131,7 +121,7 @@ def _views(frames: Sequence[Frame]) -> tuple[list[LongAxis], list[str]]:
     """
     views: list[LongAxis] = []
     reasons = []
-    for one in _by_series(frames):
+    for one in by_series(frames).values():
         view = _view(one)
         if isinstance(view, str):
             reasons.append(f"{one[0].series}: no long-axis view: {view}")
@@ -155,7 +145,7 @@ def _view(frames: Sequence[Frame]) -> LongAxis | str | None:
         return None
     if any(frame.rr_ms is None for frame in frames):
         return "it has no RR interval; cine.rr_ms in study.yaml gives one"
-    names = [name for name in first.times_ms if all(name in one.times_ms for one in frames)]
+    names = time_ranges_ms(frames)
     if not names:
         return "it has no trigger times"
     # The most trusted of those that tell most images apart, as for the stack.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
 from pipeline.geometry import Float, Float32, Mask
+from pipeline.imaging.depth import depth_px
 from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE, most_probable
 
 AORTA, RIGHT_HEART = LABELS["aorta"], (LABELS["rv_cavity"], LABELS["right_atrium"])
@@ -182,7 +182,7 @@ def _discs(plane: Mask, pixel_mm: float) -> list[Mask]:
         return []
     # With a rim of background, where the plane has one.
     box = tuple(slice(max(0, side.start - 1), side.stop + 1) for side in found[0])
-    depth = cv2.distanceTransform(plane[box].astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    depth = depth_px(plane[box])
     middles, count = ndimage.label(h_maxima(depth, WAIST_MM / pixel_mm), np.ones((3, 3), bool))
     parts = np.zeros(plane.shape, np.int32)
     parts[box] = watershed(-depth, middles, mask=plane[box])

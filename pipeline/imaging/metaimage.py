@@ -73,6 +73,38 @@ def _require_all_bytes(path: Path) -> None:
     The library tells the terminal of it, not what is wrong, and takes damaged ones as they are.
     """
     header, start = _header_of(path)
+    whole, where = _bytes_told(path, header), header.get(_HEADER_ENDS, "")
+    if "%" in where and not _NUMBERED.fullmatch(where):
+        raise InputError(
+            f"{path}: {_HEADER_ENDS} = {where} names no files; it needs LOCAL, the name of one, or "
+            "a pattern such as image%03d.raw 0 9 1"
+        )
+    if _SEVERAL_FILES.search(where):
+        return
+    pixels = path if where.upper() == "LOCAL" else path.parent / where
+    if not pixels.is_file():
+        raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
+    start = start if pixels == path else 0
+    packed = header.get("CompressedData", "False").upper() == "TRUE"
+    needed = _number(header.get("CompressedDataSize")) if packed else whole
+    # Of a file of its own the library takes all there is.
+    if needed is None and pixels == path:
+        raise InputError(
+            f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
+            "it again, or uncompressed"
+        )
+    found = pixels.stat().st_size - start
+    if needed is not None and found < needed:
+        raise InputError(
+            f"{pixels}: ends too early: its pixels need {needed} bytes, it holds {found} of them; "
+            f"{_COPY}"
+        )
+    if packed:
+        _require_unpacked(pixels, start, whole)
+
+
+def _bytes_told(path: Path, header: Fields) -> int:
+    """How many bytes the pixels take, unpacked; refuse a header that is none of grey frames."""
     values, kind = _values(header), header.get("ElementType", "")
     if values is None:
         raise InputError(f"{path}: its header tells no DimSize in whole numbers; {_COPY}")
@@ -93,34 +125,7 @@ def _require_all_bytes(path: Path) -> None:
             f"{path}: NDims is {header.get('NDims', 'missing')} and DimSize has {axes} numbers; a "
             f"sequence has three of both; {_COPY}"
         )
-    whole = values * _VALUE_BYTES[kind]
-    where = header.get(_HEADER_ENDS, "")
-    if "%" in where and not _NUMBERED.fullmatch(where):
-        raise InputError(
-            f"{path}: {_HEADER_ENDS} = {where} names no files; it needs LOCAL, the name of one, or "
-            "a pattern such as image%03d.raw 0 9 1"
-        )
-    if _SEVERAL_FILES.search(where):
-        return
-    pixels = path if where.upper() == "LOCAL" else path.parent / where
-    if not pixels.is_file():
-        raise InputError(f"{path}: its pixels are in {pixels}, which is no file; copy it beside it")
-    packed = header.get("CompressedData", "False").upper() == "TRUE"
-    # Of a file of its own the library takes all there is.
-    if packed and pixels == path and _number(header.get("CompressedDataSize")) is None:
-        raise InputError(
-            f"{path}: does not say how long its compressed pixels are (CompressedDataSize); save "
-            "it again, or uncompressed"
-        )
-    needed = _number(header.get("CompressedDataSize")) if packed else whole
-    found = pixels.stat().st_size - (start if pixels == path else 0)
-    if needed is not None and found < needed:
-        raise InputError(
-            f"{pixels}: ends too early: its pixels need {needed} bytes, it holds {found} of them; "
-            f"{_COPY}"
-        )
-    if packed:
-        _require_unpacked(pixels, start if pixels == path else 0, whole)
+    return values * _VALUE_BYTES[kind]
 
 
 def _require_unpacked(path: Path, start: int, needed: int) -> None:

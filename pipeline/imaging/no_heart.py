@@ -8,8 +8,7 @@ from scipy import ndimage
 from pipeline.errors import StageError
 from pipeline.geometry import Float, Integer, Label, Mask
 from pipeline.imaging.cine import Cine
-from pipeline.imaging.cut_off import BODIES
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE
 from pipeline.imaging.settings import SegmentSettings
 from pipeline.imaging.view import View
 
@@ -129,7 +128,7 @@ def require_understood(
 
 def _shows_left_ventricle(drawn: Label) -> Mask:
     """``(slice,)``: whether cavity or muscle is drawn in half of the phases."""
-    left = np.isin(drawn, [LABELS["lv_cavity"], LABELS["lv_myocardium"]]).any(axis=(2, 3))
+    left = np.isin(drawn, (CAVITY, MUSCLE)).any(axis=(2, 3))
     return np.asarray(left.mean(axis=0) >= 0.5)
 
 
@@ -144,7 +143,7 @@ def missed_hearts(drawn: Label, pixel_mm: float) -> Integer:
     heart = drawn > 0
     # What one of them shows elsewhere, as a vessel or a bowel beyond the tip, is no heart missed;
     # nor what looks like muscle alone, as fat in line with the tip.
-    blood = heart & (drawn != LABELS["lv_myocardium"])
+    blood = heart & (drawn != MUSCLE)
     shown = heart & blood.any(axis=(2, 3), keepdims=True)
     both = (shown[:, :-2] & shown[:, 2:]).sum(axis=(2, 3))
     missed = heart[:, 1:-1].sum(axis=(2, 3)) < LEAST_SHARE * both
@@ -154,7 +153,7 @@ def missed_hearts(drawn: Label, pixel_mm: float) -> Integer:
 
 def require_ring(drawn: Label, view: View) -> None:
     """Refuse what has no left ventricle: a cavity that lies in its muscle or by other chambers."""
-    cavity = drawn == LABELS["lv_cavity"]
+    cavity = drawn == CAVITY
     cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)[None, None]
     border = ndimage.binary_dilation(cavity, cross) & ~cavity
     bare = (border & (drawn == 0)).sum(axis=(1, 2, 3)) / np.maximum(border.sum(axis=(1, 2, 3)), 1)
@@ -177,7 +176,7 @@ def require_ventricles(drawn: Label, view: View, settings: SegmentSettings) -> N
 
 def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> None:
     """Refuse a phase that shows no left ventricle to speak of."""
-    ventricle = (drawn == LABELS["lv_cavity"]) | (drawn == LABELS["lv_myocardium"])
+    ventricle = np.isin(drawn, (CAVITY, MUSCLE))
     volume_ml = ventricle.sum(axis=(1, 2, 3)) * view.pixel_mm**2 * view.slice_step_mm / 1000
     if volume_ml.min() < settings.min_ventricle_ml:
         raise StageError(
@@ -190,9 +189,7 @@ def _require_ventricle(drawn: Label, view: View, settings: SegmentSettings) -> N
 
 def _require_cavity(drawn: Label) -> None:
     """Refuse what looks like a left ventricle that is muscle throughout in all phases."""
-    cavity, muscle = (
-        (drawn == LABELS[name]).sum(axis=(1, 2, 3)) for name in BODIES["left ventricle"]
-    )
+    cavity, muscle = ((drawn == value).sum(axis=(1, 2, 3)) for value in (CAVITY, MUSCLE))
     share = cavity / np.maximum(muscle, 1)
     if share.max() < LEAST_CAVITY:
         raise StageError(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry import Float, Label, Mask
-from pipeline.imaging.labels import LABELS
+from pipeline.imaging.labels import CAVITY, LABELS, MUSCLE
 from pipeline.imaging.view import AS_THE_FILE_SAYS, Orientation
 
 RIGHT_DEG = -165.0
@@ -66,14 +66,11 @@ class Lie:
     and aorta counting as more."""
 
     @property
-    def right_deg(self) -> float:
-        """Direction of `right`, from columns towards rows."""
-        return float(np.degrees(np.arctan2(self.right[1], self.right[0])))
-
-    @property
     def off_deg(self) -> float:
         """How far the right ventricle is from where a canonical view has it, 0 to 180."""
-        return abs(_wrapped(self.right_deg - RIGHT_DEG)) if self.right.any() else 0.0
+        if not self.right.any():
+            return 0.0
+        return abs(_wrapped(_angle_deg(self.right[0], self.right[1]) - RIGHT_DEG))
 
     @property
     def is_canonical(self) -> bool:
@@ -83,7 +80,7 @@ class Lie:
 
 def lie_of(labels: Label) -> Lie:
     """How the ventricles lie, from labels ``(slice, row, column)``."""
-    left = (labels == LABELS["lv_cavity"]) | (labels == LABELS["lv_myocardium"])
+    left = np.isin(labels, (CAVITY, MUSCLE))
     right = labels == LABELS["rv_cavity"]
     weights, vectors = [0.0], [np.zeros(2)]
     for one, other in zip(left, right, strict=True):
@@ -162,7 +159,7 @@ def _vote(look: Look) -> tuple[Float, float]:
 
 def _orientation(right: Float, mirrored: bool, upside_down: bool) -> Orientation:
     """The orientation that brings the right ventricle, seen in the file's view, to its place."""
-    seen_deg = float(np.degrees(np.arctan2(right[1], -right[0] if mirrored else right[0])))
+    seen_deg = _angle_deg(-right[0] if mirrored else right[0], right[1])
     turn_deg = _wrapped(seen_deg - RIGHT_DEG)
     known = bool(right.any()) and abs(turn_deg) > LEAST_TURN_DEG
     return Orientation(turn_deg if known else 0.0, mirrored, upside_down)
@@ -192,6 +189,11 @@ def _rise(ventricles: Mask, above: Mask) -> float:
 def _centre(mask: Mask) -> Float:
     rows, columns = np.nonzero(mask)
     return np.array([columns.mean(), rows.mean()])
+
+
+def _angle_deg(column: float, row: float) -> float:
+    """Direction from columns towards rows."""
+    return float(np.degrees(np.arctan2(row, column)))
 
 
 def _wrapped(angle_deg: float) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.frames import LEAST_OF_A_BEAT
 
 ALIKE = 0.05
@@ -47,6 +47,21 @@ def common_phases(
     _require_rising(common, trigger_times_ms, rr_ms, where)
     _require_alike(phases, rr_ms, where, numbers)
     return np.asarray(common)
+
+
+def around_phases(asked: Float, phases: Float) -> tuple[Integer, Integer, Float32]:
+    """Where phases ``(n,)`` lie among others, ``(phase,)`` in [0, 1) and rising, of a cycle.
+
+    Returns
+    -------
+    before, after, share
+        ``(n,)`` each: the two numbers between which they lie, and the part of the way.
+    """
+    count = len(phases)
+    times = np.append(phases, phases[0] + 1)
+    place = np.interp((asked - phases[0]) % 1 + phases[0], times, np.arange(count + 1))
+    before = np.floor(place).astype(int)
+    return before % count, (before + 1) % count, (place - before).astype(np.float32)
 
 
 def _require_heartbeats(rr_ms: Float, where: str) -> None:

@@ -23,7 +23,7 @@ from pipeline.geometry import Float32, Mask
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.cleanup import THREADS
 from pipeline.imaging.inference import PlaneProbability, darkest_grey, sampled_slice
-from pipeline.imaging.labels import LABELS, MUSCLE, most_probable
+from pipeline.imaging.labels import LABELS, MUSCLE
 
 RIGHT = LABELS["rv_cavity"]
 CHAMBERS = (RIGHT, LABELS["left_atrium"])
@@ -69,13 +69,12 @@ def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
 
     What was background alone becomes chamber; a slice tells of its own planes.
     """
-    count = found.planes_a_slice
     nothing = darkest_grey(cine.intensity)
     whole = _whole_slices(found)
 
     def one(place: tuple[int, int]) -> None:
         phase, number = place
-        planes = found.value[phase, number * count : (number + 1) * count]
+        planes = found.of_slice(phase, number)
         chambers = [
             chamber
             for chamber in CHAMBERS
@@ -92,11 +91,8 @@ def settle_plain_blood(found: PlaneProbability, cine: Cine) -> None:
 
 def _whole_slices(found: PlaneProbability) -> Mask:
     """Where nearly the largest ring of muscle of its phase is cut, ``(phase, slice)``."""
-    cuts = [
-        (most_probable(found.at_slices(phase)) == MUSCLE).sum(axis=(1, 2))
-        for phase in range(len(found.value))
-    ]
-    return np.asarray(np.array(cuts) >= WHOLE_RING * np.max(cuts, axis=1, keepdims=True))
+    cuts = (found.drawn() == MUSCLE).sum(axis=(2, 3))
+    return np.asarray(cuts >= WHOLE_RING * cuts.max(axis=1, keepdims=True))
 
 
 def _unsure(planes: Float32, chamber: int) -> Mask:

@@ -148,7 +148,7 @@ def _look(cine: Cine, along: Float, acquired: Cine | None = None) -> _Look | Non
     found = label_probability(cine, place.view, 1)
     if acquired is not None:
         clear_beyond(found, acquired)
-    drawn = np.stack([most_probable(found.at_slices(k)) for k in range(len(found.value))])
+    drawn = found.drawn()
     ventricle = _largest_body((drawn == CAVITY) | (drawn == MUSCLE))
     cavity = ventricle & (drawn == CAVITY)
     if cavity.any(axis=0).sum() < 2:
@@ -294,6 +294,17 @@ def _places(target_from_index: Float, shape: Sequence[int]) -> Float:
     return np.moveaxis(points[..., ::-1], -1, 0)
 
 
+def _lie_on(shape: Sequence[int], places: Float, beside: float = 0.0) -> Mask:
+    """Which places ``(3, ...)`` lie on an array ``(z, y, x)``, or ``beside`` pixels off at most."""
+    last = np.reshape(shape, (3, 1, 1, 1)) - 1
+    return np.asarray(((places >= -beside) & (places <= last + beside)).all(axis=0))
+
+
+def _shape_of_planes(found: PlaneProbability) -> tuple[int, int, int]:
+    planes, _, rows, columns = found.value.shape[1:]
+    return planes, rows, columns
+
+
 def _mr_from_planes(found: PlaneProbability) -> Float:
     """4x4: ``(column, row, plane)`` of the labelled planes to LPS mm."""
     view = found.view
@@ -306,13 +317,11 @@ def _mr_from_planes(found: PlaneProbability) -> Float:
 
 def clear_beyond(found: PlaneProbability, acquired: Cine) -> None:
     """Make background certain where nothing was acquired, in place."""
-    planes, _, rows, columns = found.value.shape[1:]
     index_from_planes = np.linalg.inv(acquired.mr_from_index) @ _mr_from_planes(found)
-    places = _places(index_from_planes, (planes, rows, columns))
-    last = np.array(acquired.intensity.shape[1:])[:, None, None, None] - 1
-    beyond = np.any((places < -0.5) | (places > last + 0.5), axis=0)
-    for plane in range(planes):
-        found.value[:, plane, :, beyond[plane]] = np.eye(CLASSES, dtype=np.float32)[0]
+    places = _places(index_from_planes, _shape_of_planes(found))
+    beyond = ~_lie_on(acquired.intensity.shape[1:], places, 0.5)
+    for plane, none in enumerate(beyond):
+        found.value[:, plane, :, none] = np.eye(CLASSES, dtype=np.float32)[0]
 
 
 def mix_in_own(
@@ -340,12 +349,9 @@ def mix_in_own(
         one = replace(acquired, intensity=acquired.intensity[only], phases=acquired.phases[only])
         own = label_probability(one, place.view, 1)
         if places is None:
-            places = _places(
-                np.linalg.inv(_mr_from_planes(own)) @ _mr_from_planes(found),
-                (drawn.shape[0], *drawn.shape[2:]),
-            )
-            last = np.array([own.value.shape[k] for k in (1, 3, 4)])[:, None, None, None] - 1
-            share = OWN_SHARE * np.all((places >= 0) & (places <= last), axis=0)
+            own_from_planes = np.linalg.inv(_mr_from_planes(own)) @ _mr_from_planes(found)
+            places = _places(own_from_planes, _shape_of_planes(found))
+            share = OWN_SHARE * _lie_on(_shape_of_planes(own), places)
         for number in range(CLASSES):
             seen = ndimage.map_coordinates(own.value[0, :, number], places, np.float32, order=1)
             drawn[:, number] += share * (seen - drawn[:, number])
@@ -360,8 +366,7 @@ def labels_on_acquired(found: PlaneProbability, acquired: Cine) -> Label:
     """
     planes_from_index = np.linalg.inv(_mr_from_planes(found)) @ acquired.mr_from_index
     places = _places(planes_from_index, acquired.intensity.shape[1:])
-    last = np.array([found.value.shape[k] for k in (1, 3, 4)]) - 1
-    within = ((places >= 0) & (places <= last[:, None, None, None])).all(axis=0)
+    within = _lie_on(_shape_of_planes(found), places)
     shown = places[:, within]
 
     def labels(planes: Float32) -> Label:

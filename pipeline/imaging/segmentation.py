@@ -28,7 +28,7 @@ from pipeline.imaging.inference import (
 from pipeline.imaging.interpolation import class_margins, isotropic_labels
 from pipeline.imaging.labels import LABELS, most_probable
 from pipeline.imaging.locating import Found, locate_heart
-from pipeline.imaging.long_axis import NO_CROSSINGS, Crossings, find_crossings
+from pipeline.imaging.long_axis import NO_CROSSINGS, find_crossings
 from pipeline.imaging.lookalikes import (
     clear_apex,
     favour_left_atrium,
@@ -53,7 +53,7 @@ from pipeline.imaging.reformat import (
 )
 from pipeline.imaging.settings import THIN_MM, SegmentSettings
 from pipeline.imaging.unrecorded import require_finite
-from pipeline.imaging.view import Orientation, View
+from pipeline.imaging.view import Orientation
 from pipeline.progress import Progress
 
 
@@ -157,39 +157,36 @@ def _segment(
     favour_left_atrium(found.value)
     favour_left_cavity(found.value)
     # Judged before phases are mixed and islands removed, which would hide a spoilt image.
-    seen = _drawn(found)
+    seen = found.drawn()
     require_ring(seen, found.view)
     confidence = slice_confidence(cine, found, seen)
     if through is None:
         require_no_gap(seen, found.view)
     require_understood(seen, confidence, found.view, settings)
-    settle_plain_blood(found, cine)
-    flicker = settle_flicker(found.value, cine.phases, found.view.pixel_mm)
-    settle_tricuspid(found.value)
-    share = settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2)
-    blend_phases(found.value, share, cine.phases)
-    step_mm = found.view.slice_step_mm / found.planes_a_slice
-    clean_cycle(found.value, found.view.pixel_mm, step_mm)
-    end_at_dark_line(found, cine)
-    drawn = _drawn(found)
+    flicker = _put_right(found, cine, settings)
+    drawn = found.drawn()
     require_ventricles(drawn, found.view, settings)
     crossings = find_crossings(cine, views, found.view, drawn) if views else NO_CROSSINGS
-    acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
-    labels = (
-        _on_cine(found, cine) if through is None else labels_on_acquired(found, through.acquired)
-    )
+    if through is None:
+        labels = _on_cine(found, cine)
+        confidence = confidence[:, np.argsort(found.view.order)]
+    else:
+        labels = labels_on_acquired(found, through.acquired)
+        confidence = confidence_on_acquired(confidence, found, through.acquired, labels)
     if bring_to_one_axis(found, cine):
-        drawn = _drawn(found)
+        drawn = found.drawn()
+    acquired = np.flatnonzero(~np.isin(found.view.order, cine.interpolated))
+    heights_mm = found.view.slice_step_mm * np.asarray(acquired, float)
     shifts_mm = np.zeros((len(acquired), 3))
     if settings.correct_shifts:
-        shifts_mm = _shifts_mm(drawn[:, acquired], acquired, found.view, crossings)
+        shifts_mm = slice_shifts_mm(
+            drawn[:, acquired], found.view.pixel_mm, heights_mm, found.view.axes, crossings
+        )
     heart, heart_mr_from_index = _isotropic(found, settings, shifts_mm, acquired)
     numbers = np.asarray(found.view.order)[acquired]
+    apart = {}
     if through is None:
-        confidence = confidence[:, np.argsort(found.view.order)]
         apart = out_of_step(drawn[:, acquired], cine.phases, found.view.pixel_mm)
-    else:
-        confidence, apart = confidence_on_acquired(confidence, found, through.acquired, labels), {}
     return Segmentation(
         labels,
         heart,
@@ -202,6 +199,19 @@ def _segment(
         place.orientation,
         None if through is None else through.tilt_deg,
     )
+
+
+def _put_right(found: PlaneProbability, cine: Cine, settings: SegmentSettings) -> Float:
+    """Mend in place what hearts and blood do not do; the widths of means (`settle_flicker`)."""
+    settle_plain_blood(found, cine)
+    flicker = settle_flicker(found.value, cine.phases, found.view.pixel_mm)
+    settle_tricuspid(found.value)
+    share = settings.phase_blend * min(1.0, (len(cine.phases) / 25) ** 2)
+    blend_phases(found.value, share, cine.phases)
+    step_mm = found.view.slice_step_mm / found.planes_a_slice
+    clean_cycle(found.value, found.view.pixel_mm, step_mm)
+    end_at_dark_line(found, cine)
+    return flicker
 
 
 def _looked_at(
@@ -231,11 +241,6 @@ def _half(progress: Progress | None, number: int) -> Progress | None:
     return lambda done, total: progress(number * total + done, 2 * total)
 
 
-def _shifts_mm(drawn: Label, acquired: Integer, view: View, crossings: Crossings) -> Float:
-    heights_mm = view.slice_step_mm * np.asarray(acquired, float)
-    return slice_shifts_mm(drawn, view.pixel_mm, heights_mm, view.axes, crossings)
-
-
 def _astray_mm(shifts_mm: Float, numbers: Integer) -> dict[int, float]:
     """Slices moved by more than `ASTRAY_MM` in their plane, by number, and by how much."""
     aside_mm = np.hypot(shifts_mm[:, 0], shifts_mm[:, 1])
@@ -259,12 +264,6 @@ def _flicker_beats(widths_beats: Float, found: PlaneProbability, drawn: Label) -
     return {number: width for number, width in by_number if width}
 
 
-def _drawn(found: PlaneProbability) -> Label:
-    """Most probable labels on the slices, ``(phase, slice, row, column)``."""
-    phases = range(len(found.value))
-    return np.stack([most_probable(found.at_slices(k)) for k in phases])
-
-
 def _isotropic(
     found: PlaneProbability, settings: SegmentSettings, shifts_mm: Float, acquired: Integer
 ) -> tuple[Label, Float]:
@@ -274,7 +273,7 @@ def _isotropic(
     ``shifts_mm`` ``(slice, 3)`` is taken from them.
     """
     view = found.view
-    heights_mm = view.slice_step_mm * np.asarray(acquired, float)
+    heights_mm = view.slice_step_mm * acquired
     count = found.planes_a_slice
     planes = (count * acquired[:, None] + np.arange(count)).ravel()
     # Planes between two slices stay in line with both.
@@ -290,8 +289,6 @@ def _isotropic(
         settings.margin_mm,
         count,
     )
-    volume, added = _with_margin(volume, round(settings.margin_mm / settings.grid_mm))
-    first_mm = first_mm - (0, 0, added * settings.grid_mm)
     axes, corner_mm = view.axes, view.corner_mm + first_mm @ view.axes
     if np.linalg.det(axes) < 0:
         # Seen mirrored; stored unmirrored, since readers of surfaces count on right-handed grids.
@@ -302,16 +299,6 @@ def _isotropic(
     mr_from_index[:3, :3] = axes.T * settings.grid_mm
     mr_from_index[:3, 3] = corner_mm
     return volume, mr_from_index
-
-
-def _with_margin(volume: Label, margin: int) -> tuple[Label, int]:
-    """Empty planes added where the heart reaches the stack's ends, and how many in front."""
-    found = np.flatnonzero(volume.any(axis=(0, 2, 3)))
-    if not len(found):
-        return volume, 0
-    before = max(0, margin - int(found[0]))
-    after = max(0, margin - (volume.shape[1] - 1 - int(found[-1])))
-    return np.pad(volume, ((0, 0), (before, after), (0, 0), (0, 0))), before
 
 
 def _on_cine(found: PlaneProbability, cine: Cine) -> Label:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import compress
 from operator import itemgetter
 
 import numpy as np
@@ -24,11 +25,13 @@ from pipeline.imaging.frames import (
     Frame,
     are_in_one_beat,
     are_parallel,
+    by_series,
     count_moments,
     fit_each_other,
     have_same_axes,
     is_cine,
     is_stack,
+    places_along_mm,
     sets_alike,
     slice_positions,
     span_beat,
@@ -79,17 +82,11 @@ def choose_stack(frames: Sequence[Frame], where: str) -> tuple[list[Frame], list
             left_out += _spared(others, reason)
         elif _joins(stack[0], others[0]):
             slices_mm, normal = slice_positions(stack), stack[0].normal
-            apart = _are_between(others, normal, slices_mm)
-            twice = [
-                one
-                for one, between in zip(others, apart, strict=True)
-                if not between and _covered([one], normal, slices_mm)
-            ]
-            left_out += _spared(
-                twice, f"{others[0].kind} images, slices that the stack has already"
-            )
-            known = {id(one) for one in twice}
-            stack = stack + [one for one in others if id(one) not in known]
+            twice = _on_slices(others, normal, slices_mm)
+            twice &= ~_are_between(others, normal, slices_mm)
+            reason = f"{others[0].kind} images, slices that the stack has already"
+            left_out += _spared(compress(others, twice), reason)
+            stack = [*stack, *compress(others, ~twice)]
         else:
             _refuse(stack[0], others[0], where)
     return stack, left_out
@@ -182,49 +179,38 @@ def _require_one_largest(ranked: Sequence[tuple[Rank, list[Frame]]], where: str)
 
 def _by_pace(frames: list[Frame]) -> list[list[Frame]]:
     """Part series in real time from a cine that has slices of theirs, and their very matrix."""
-    by_series = _by_series(frames)
-    slow = {name for name, one in by_series.items() if not are_in_one_beat(one)}
+    series = by_series(frames)
+    slow = {name for name, one in series.items() if not are_in_one_beat(one)}
     cine = [frame for frame in frames if frame.series_uid not in slow]
     if not slow or not cine or not is_cine(cine):
         return [frames]
     slices_mm, normal = slice_positions(cine), cine[0].normal
     # A slice of which there is no other is the cine's own, and runs over its beat.
-    slow = {
-        name
-        for name in slow
-        if any(_covered([frame], normal, slices_mm) for frame in by_series[name])
-    }
+    slow = {name for name in slow if _on_slices(series[name], normal, slices_mm).any()}
     gated = [frame for frame in frames if frame.series_uid not in slow]
     running = [frame for frame in frames if frame.series_uid in slow]
     return [gated, running] if running else [gated]
 
 
-def _by_series(frames: Sequence[Frame]) -> dict[str, list[Frame]]:
-    by_series: dict[str, list[Frame]] = {}
-    for frame in frames:
-        by_series.setdefault(frame.series_uid, []).append(frame)
-    return by_series
-
-
 def _without_stills(frames: Sequence[Frame]) -> tuple[list[Frame], list[Frame]]:
     """Part series that are no cine, but of the matrix of cines, from these."""
-    by_series = _by_series(frames)
-    single = {name for name, one in by_series.items() if max(count_moments(one)) < MIN_PHASES}
-    moving = {name for name, one in by_series.items() if name not in single and span_beat(one)}
+    series = by_series(frames)
+    single = {name for name, one in series.items() if max(count_moments(one)) < MIN_PHASES}
+    moving = {name for name, one in series.items() if name not in single and span_beat(one)}
     cine = [frame for frame in frames if frame.series_uid in moving]
     if not cine:
         return list(frames), []
     slices_mm, normal = slice_positions(cine), cine[0].normal
-    elsewhere = {name for name in single if not _covered(by_series[name], normal, slices_mm)}
+    elsewhere = {name for name in single if not _covered(series[name], normal, slices_mm)}
     # A cine may be stored with a series for each phase, and some of its slices otherwise.
     beyond = [frame for frame in frames if frame.series_uid in elsewhere]
     if beyond and is_cine(beyond):
         single -= elsewhere
     elif len(single - elsewhere) <= len(elsewhere):
         # Late enhancement may have a series for each slice, most of them slices of the cine.
-        single -= {name for name in elsewhere if len(slice_positions(by_series[name])) == 1}
-    short = by_series.keys() - moving - single - elsewhere
-    stills = single | {name for name in short if _within(by_series[name], cine, slices_mm)}
+        single -= {name for name in elsewhere if len(slice_positions(series[name])) == 1}
+    short = series.keys() - moving - single - elsewhere
+    stills = single | {name for name in short if _within(series[name], cine, slices_mm)}
     return (
         [frame for frame in frames if frame.series_uid not in stills],
         [frame for frame in frames if frame.series_uid in stills],
@@ -237,13 +223,8 @@ def _within(series: Sequence[Frame], cine: Sequence[Frame], slices_mm: Float) ->
     normal = cine[0].normal
     if not _covered(series, normal, slices_mm):
         return False
-    near_mm = _half_step_mm(slices_mm)
-    places_mm = np.array([float(frame.middle_mm @ normal) for frame in series])
-    beside = [
-        frame
-        for frame in cine
-        if np.abs(places_mm - float(frame.middle_mm @ normal)).min() < near_mm
-    ]
+    apart_mm = places_along_mm(cine, normal)[:, None] - places_along_mm(series, normal)
+    beside = list(compress(cine, np.abs(apart_mm).min(axis=1) < _half_step_mm(slices_mm)))
     own_ms, theirs_ms = time_ranges_ms(series), time_ranges_ms(beside)
     # By one attribute for both: times of acquisition and of triggers count from other moments.
     shared = [name for name in theirs_ms if name in own_ms]
@@ -262,7 +243,12 @@ def _half_step_mm(slices_mm: Float) -> float:
 
 def _covered(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> bool:
     """Whether the frames show only slices that are there: within half a step of one."""
-    return bool(_half_steps(frames, normal, slices_mm).max() < 1 + ROUNDING)
+    return bool(_on_slices(frames, normal, slices_mm).all())
+
+
+def _on_slices(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Mask:
+    """Which frames ``(n,)`` show slices that are there."""
+    return _half_steps(frames, normal, slices_mm) < 1 + ROUNDING
 
 
 def _are_between(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Mask:
@@ -277,8 +263,7 @@ def _are_between(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Ma
 
 def _half_steps(frames: Sequence[Frame], normal: Float, slices_mm: Float) -> Float:
     """How far each frame lies from the nearest slice, in half steps."""
-    along_mm = np.array([float(frame.middle_mm @ normal) for frame in frames])
-    away_mm = np.abs(along_mm[:, None] - slices_mm).min(axis=1)
+    away_mm = np.abs(places_along_mm(frames, normal)[:, None] - slices_mm).min(axis=1)
     return np.asarray(away_mm / _half_step_mm(slices_mm))
 
 

@@ -42,8 +42,7 @@ def doubts_of_order(cine: Cine) -> tuple[str, ...]:
     phases, slices = images.shape[:2]
     doubts = []
     if slices <= MOST_ORDERED:
-        plain = images - images.mean(axis=2, keepdims=True)
-        plain /= np.maximum(np.linalg.norm(plain, axis=2, keepdims=True), 1e-9)
+        plain = of_one_contrast(images)
         # A blank slice is as unlike one neighbour as another.
         shown = np.flatnonzero(plain.any(axis=(0, 2)))
         unlike = 1 - np.einsum("kip,kjp->ij", plain[:, shown], plain[:, shown]) / phases
@@ -85,6 +84,12 @@ def small_images(cine: Cine) -> Float32:
         ],
         np.float32,
     )
+
+
+def of_one_contrast(images: Float32) -> Float32:
+    """Images ``(phase, slice, pixel)`` of mean 0 and length 1; blank ones are 0."""
+    plain = images - images.mean(axis=2, keepdims=True)
+    return np.asarray(plain / np.maximum(np.linalg.norm(plain, axis=2, keepdims=True), 1e-9))
 
 
 def _by_names(apart: Float) -> tuple[list[int], float]:

@@ -60,7 +60,7 @@ def always_identity(frames: Sequence[Fields]) -> frozenset[str]:
 
 
 def is_tracked(
-    fields: Fields, frame: str, with_calibration: bool, resting: AbstractSet[str] = frozenset()
+    fields: Fields, frame: str, with_calibration: bool, resting: AbstractSet[str]
 ) -> bool:
     """Whether the picture and all transforms of its pose are valid, that of its pixels included.
 
@@ -122,7 +122,7 @@ def _invertible(probe_from_image: Float) -> Float:
     return whole
 
 
-def reference_pose(fields: Fields, resting: AbstractSet[str] = frozenset()) -> Float | None:
+def reference_pose(fields: Fields, resting: AbstractSet[str]) -> Float | None:
     """4x4 from the patient's reference to the tracker; None where the recording does not tell, as
     by an identity of what is not ``resting`` there (`always_identity`)."""
     direct = _pose_if_valid(fields, (REFERENCE, TRACKER), resting)

@@ -18,6 +18,11 @@ from scipy.interpolate import CubicHermiteSpline
 from pipeline.geometry import Float, Float32, Integer
 from pipeline.imaging.labels import CAVITY, MUSCLE
 
+BAND_MM = 4.0
+"""Depths are cut off here. Planes are some 3 mm apart, so a wall may lean by 50 degrees and its
+slope still be followed; the seam between two structures that end against each other is notched
+by a third of this at its rim."""
+
 TAPER_MM = 20.0
 """How a body tapers towards the tip is told by its cuts this near to the last one."""
 
@@ -49,7 +54,7 @@ class _Dome(NamedTuple):
 
 
 def taper_ventricle(
-    depth_mm: Float32, height_mm: Float, slices: Integer, ventricle_mm: Float32, band_mm: float
+    depth_mm: Float32, height_mm: Float, slices: Integer, ventricle_mm: Float32
 ) -> tuple[Float32, Float]:
     """Planes on which the left ventricle is drawn from the slices, from its widest cut to its tip.
 
@@ -68,8 +73,6 @@ def taper_ventricle(
         ``(slice,)`` which of the planes are slices.
     ventricle_mm
         ``(slice, row, column)`` depth in the ventricle, cavity and muscle together.
-    band_mm
-        Depths are cut off here.
 
     Returns
     -------
@@ -92,7 +95,7 @@ def taper_ventricle(
     between = _Between(slice_mm[first : widest + 1], ventricle_mm[first : widest + 1])
 
     depth_mm, height_mm = _with_planes(
-        np.clip(depth_mm, -band_mm, band_mm), height_mm, outside.end_mm, slice_mm[widest]
+        np.clip(depth_mm, -BAND_MM, BAND_MM), height_mm, outside.end_mm, slice_mm[widest]
     )
     for plane, at_mm in zip(depth_mm, height_mm, strict=True):
         if at_mm >= slice_mm[widest] or at_mm in slice_mm[first:]:
@@ -101,7 +104,7 @@ def taper_ventricle(
         if at_mm < outside.height_mm:
             _draw_tip(plane, outside.at(at_mm), cavity_mm)
         else:
-            _draw_between(plane, between.at(at_mm), cavity_mm, band_mm)
+            _draw_between(plane, between.at(at_mm), cavity_mm)
     return depth_mm, height_mm
 
 
@@ -175,13 +178,13 @@ def _draw_tip(plane: Float32, body_mm: Float32, cavity_mm: Float32) -> None:
     plane[0] = -plane[1:].max(axis=0)
 
 
-def _draw_between(plane: Float32, body_mm: Float32, cavity_mm: Float32, band_mm: float) -> None:
+def _draw_between(plane: Float32, body_mm: Float32, cavity_mm: Float32) -> None:
     """Put the ventricle into a plane between two slices in place of what it was there."""
     others = [k for k in range(len(plane)) if k not in (CAVITY, MUSCLE)]
     around = plane[others]
     nearest = around.max(axis=0)
     given_up = (body_mm < 0) & (nearest < 0)
-    left = around - nearest + np.minimum(-body_mm, band_mm)
+    left = around - nearest + np.minimum(-body_mm, BAND_MM)
     plane[others] = np.where(given_up, left, np.minimum(around, -body_mm))
     # Where it opens into an atrium or the aorta there is no muscle.
     lid_mm = np.where(around[0] >= nearest, LID_MM, 0)

@@ -52,18 +52,13 @@ class Body:
     """Index ``(x, y, z)`` of the first voxel in the grid; negative where the body is padded."""
 
 
-def _solid(volume: Label, labels: Sequence[str]) -> Mask:
-    """Where one phase shows a structure."""
-    chosen = np.zeros(256, dtype=bool)
-    chosen[[LABELS[label] for label in labels]] = True
-    return np.asarray(chosen[volume])
-
-
 def cut_out(
     heart: Label, labels: Sequence[str], spacing_mm: float, settings: SurfaceSettings
 ) -> Body:
     """Cut a structure out, make each phase one solid piece, and smooth it."""
-    solid = np.stack([_solid(volume, labels) for volume in heart])
+    chosen = np.zeros(256, dtype=bool)
+    chosen[[LABELS[label] for label in labels]] = True
+    solid = chosen[heart]
     seen = [np.flatnonzero(solid.any(axis=tuple({0, 1, 2, 3} - {axis}))) for axis in (1, 2, 3)]
     low, high = np.array([(lines[0], lines[-1] + 1) for lines in seen]).T
     cut = solid[:, low[0] : high[0], low[1] : high[1], low[2] : high[2]]

@@ -25,6 +25,10 @@ WIDENING_ROUNDS = 4
 SLIVER_QUALITY = 0.3
 
 
+Faults = Callable[[Float, Integer], Mask]
+"""Which triangles ``(m,)`` are wrong, from vertices and triangles."""
+
+
 def extract_surface(level: LevelSet, edge_mm: float) -> Surface:
     """Closed surface of even triangles on the zero level of a signed distance.
 
@@ -139,7 +143,7 @@ def _mended(
     vertices_mm: Float,
     triangles: Integer,
     level: LevelSet,
-    faults: Callable[[Float, Integer], Mask],
+    faults: Faults,
 ) -> Float:
     """Even out the surroundings of faulty triangles ``(m,)`` until there are none."""
     wrong = faults(vertices_mm, triangles)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Float, Integer, Mask, Surface
+from pipeline.geometry import Float, Surface
 from pipeline.surface.correspondence import Smoother, make_smoother
-from pipeline.surface.mesh import laplacian
+from pipeline.surface.mesh import Faults, laplacian
 
 # Lengths of smoothing in edges: of where to act, and of the displacement, one after the other.
 SPREAD_EDGES = 2.0
 REACH_EDGES = (2.0, 4.0, 8.0, 16.0)
 # The smoothed place of faults, times this, is the share of the smooth displacement, one at most.
 GAIN = 3.0
-
-Faults = Callable[[Float, Integer], Mask]
 
 
 @dataclass(frozen=True, slots=True)
