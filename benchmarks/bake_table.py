@@ -21,10 +21,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from pipeline.field import ForceField
+from pipeline.field import BakeSettings, ForceField
 from pipeline.field.fixture import DEFAULT_FIXTURES
-
-DEFAULT_SPACING_MM, DEFAULT_MARGIN_MM = 1.5, 15.0
 
 
 def row(surfaces: Path, spacing_mm: float, margin_mm: float) -> str:
@@ -71,15 +69,15 @@ def main() -> None:
     parser.add_argument("surfaces", type=Path)
     parser.add_argument("--spacings", type=float, nargs="*", default=[2.0, 1.5, 1.25, 1.0, 0.75])
     parser.add_argument("--margins", type=float, nargs="*", default=[20.0, 30.0])
-    given = parser.parse_args()
+    given, usual = parser.parse_args(), BakeSettings()
     print(
         "| spacing (mm) | margin (mm) | MB | s | core-s | GiB | on the surface, 99 % / max (mm) | "
         "about it, 99 % (mm) | gradient, median |\n|---|---|---|---|---|---|---|---|---|"
     )
     for spacing_mm in given.spacings:
-        print(row(given.surfaces, spacing_mm, DEFAULT_MARGIN_MM), flush=True)
+        print(row(given.surfaces, spacing_mm, usual.margin_mm), flush=True)
     for margin_mm in given.margins:
-        print(row(given.surfaces, DEFAULT_SPACING_MM, margin_mm), flush=True)
+        print(row(given.surfaces, usual.spacing_mm, margin_mm), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """A small baked field with known truth, for the tests of reader, store and baking."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ from field_shapes import beating, sphere
 
 from pipeline.field import BakeSettings, Fixture
 from pipeline.field.bake import bake_field
+from pipeline.field.manifest import write_manifest
 
 PHASES = np.array([0.05, 0.2, 0.45, 0.5, 0.8])
 """Unevenly spaced, and not from 0."""
@@ -44,3 +47,17 @@ def bake_small(path: Path, **changes: Any) -> dict[str, Any]:
     """Bake the small field; its certificate."""
     given = {"mr_from_tracker": TRACKER, "rr_s": RR_S, "source": {"shape": "ball"}, **changes}
     return bake_field(path, ball_and_core(), FIXTURES, SETTINGS, **given)
+
+
+def edit(path: Path, change: Callable[[Any], object]) -> None:
+    """Change a store's description and seal it again, as a wrong program would."""
+    described = json.loads((path / "zarr.json").read_text())
+    change(described["attributes"]["beatfield"])
+    (path / "zarr.json").write_text(json.dumps(described))
+    seal(path)
+
+
+def seal(path: Path) -> None:
+    """Write the manifest of a changed store anew."""
+    (path / "manifest.json").unlink()
+    write_manifest(path)

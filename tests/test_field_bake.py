@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import pyvista
-from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, bake_small, ball_and_core
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, bake_small, ball_and_core, edit
 from field_shapes import beating, box, lumpy, sag, sphere
 
 from pipeline.cli import main
@@ -18,7 +18,6 @@ from pipeline.field import BakeSettings, Fixture, ForceField
 from pipeline.field.bake import SurfaceSeries, bake_field, grid_around
 from pipeline.field.certificate import _answered_errors, _largest, certify, require_bounds
 from pipeline.field.fixture import Bounds
-from pipeline.field.manifest import write_manifest
 from pipeline.field.steps import largest_change, largest_steps
 from pipeline.field.verify import verify_field
 from pipeline.geometry import MovingSurface
@@ -433,22 +432,14 @@ def test_a_field_is_measured_anew_on_demand(folder, tmp_path, capsys):
 def test_how_a_field_was_baked_may_be_said_otherwise(folder, tmp_path, said):
     """By another version, or by another program: it is measured by default bounds then."""
     baked = bake_own_surfaces(folder, tmp_path / "out", own_settings())
-    content = json.loads((baked / "zarr.json").read_text())
-    content["attributes"]["beatfield"]["source"]["bake"] = said
-    (baked / "zarr.json").write_text(json.dumps(content))
-    (baked / "manifest.json").unlink()
-    write_manifest(baked)
+    edit(baked, lambda told: told["source"].update(bake=said))
     assert measure_field(baked, folder)["sign_errors"] == 0
 
 
 def test_a_field_is_measured_anew_by_the_bounds_that_it_was_baked_to(folder, tmp_path):
     baked = bake_own_surfaces(folder, tmp_path / "out", own_settings(fit_rounds=0))
-    content = json.loads((baked / "zarr.json").read_text())
-    said = content["attributes"]["beatfield"]["source"]["bake"]
-    said["bounds"]["surface_error_p99_spacings"] = 1e-6
-    (baked / "zarr.json").write_text(json.dumps(content))
-    (baked / "manifest.json").unlink()
-    write_manifest(baked)
+    tight = {"surface_error_p99_spacings": 1e-6}
+    edit(baked, lambda told: told["source"]["bake"]["bounds"].update(tight))
     with pytest.raises(StageError, match=r"surface_error_p99_mm is .* allowed is 4e-06"):
         measure_field(baked, folder)
 

@@ -2,7 +2,6 @@
 
 import fcntl
 import hashlib
-import json
 import os
 import shutil
 import subprocess
@@ -15,14 +14,13 @@ import numpy as np
 import pytest
 import pyvista
 import SimpleITK
-from field_baked import PHASES, RR_S, bake_small
+from field_baked import PHASES, RR_S, bake_small, edit
 from field_random import ORIGIN_MM, SPACING_MM, write_random
 
 from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.field import ForceField
 from pipeline.field.export import WRITERS, export_field
-from pipeline.field.manifest import write_manifest
 
 ARRAYS = [f"distance_{name}" for name in ("ball", "core")]
 ARRAYS += [f"potential_{name}" for name in ("guide", "stay_in", "stay_out")]
@@ -168,18 +166,10 @@ def test_the_same_bytes_every_time(path, folders, form):
     shutil.rmtree(again)
 
 
-def set_beat(field: Path, rr_s: float | None) -> None:
-    content = json.loads((field / "zarr.json").read_text())
-    content["attributes"]["beatfield"]["rr_s"] = rr_s
-    (field / "zarr.json").write_text(json.dumps(content))
-    (field / "manifest.json").unlink()
-    write_manifest(field)
-
-
 def test_without_a_heartbeat_times_are_phases(path, tmp_path):
     field = tmp_path / "field.zarr"
     shutil.copytree(path, field)
-    set_beat(field, None)
+    edit(field, lambda told: told.update(rr_s=None))
 
     export_field(field, "nrrd", tmp_path / "nrrd")
     export_field(field, "nifti", tmp_path / "nifti")
@@ -220,7 +210,7 @@ def test_command_writes_where_one_is_unless_told_where(path, tmp_path, capsys, m
 def test_times_that_a_format_cannot_say_are_told(tmp_path, capsys, phases, form, off):
     """Of 0.9 s a beat: the second of three even phases would be at 0.39 s, and is at 0.135 s."""
     write_random(tmp_path / "f.zarr", 7, np.array(phases))
-    set_beat(tmp_path / "f.zarr", 0.9)
+    edit(tmp_path / "f.zarr", lambda told: told.update(rr_s=0.9))
     assert main(["export", str(tmp_path / "f.zarr"), "--to", form, "--out", f"{tmp_path}/o"]) == 0
     said = capsys.readouterr().out
     assert ("not evenly spaced" in said) == (off is not None)

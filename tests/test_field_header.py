@@ -8,13 +8,12 @@ import shutil
 import numpy as np
 import pytest
 from c_program import HERE, SANITIZE, build, run
-from field_baked import FIXTURES, PHASES, bake_small
+from field_baked import FIXTURES, PHASES, bake_small, edit, seal
 from field_random import EVEN, ORIGIN_MM, SPACING_MM, write_random
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import InputError
 from pipeline.field import ForceField
-from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
 from pipeline.field.tool import Needle
 
@@ -373,8 +372,7 @@ def test_any_description_is_survived(path, watched, tmp_path):
             else:
                 content[at:at] = content[at : at + chance.randint(1, 30)]
         (folder / "zarr.json").write_bytes(content)
-        (folder / "manifest.json").unlink(missing_ok=True)
-        write_manifest(folder)
+        seal(folder)
         done = run(watched, folder, given=np.zeros(4).tobytes())
         assert 0 <= done.returncode < 9
         assert done.stderr == b""
@@ -382,13 +380,7 @@ def test_any_description_is_survived(path, watched, tmp_path):
 
 def described(path, target, change):
     """A copy whose description was changed, sealed again."""
-    shutil.copytree(path, target)
-    content = json.loads((target / "zarr.json").read_text())
-    change(content["attributes"]["beatfield"])
-    (target / "zarr.json").write_text(json.dumps(content))
-    (target / "manifest.json").unlink()
-    write_manifest(target)
-    return target
+    return damaged(path, target, lambda folder: edit(folder, change))
 
 
 def test_a_force_that_python_rounds_to_the_devices_is_taken(path, program, tmp_path):

@@ -9,7 +9,7 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
-from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, TRACKER, bake_small
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, SETTINGS, TRACKER, bake_small, edit
 from field_shapes import beating, sag, sphere
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +19,6 @@ from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.field import Fixture, ForceField, kernels
 from pipeline.field.bake import bake_field
-from pipeline.field.manifest import write_manifest
 from pipeline.field.potential import direction_scale, offence, potential, pull
 from pipeline.field.query import query_point, stiffness_words
 from pipeline.geometry import Float
@@ -415,11 +414,7 @@ def test_query_says_what_the_device_has_to_follow(path, field):
 def test_a_store_with_a_fixture_that_its_device_cannot_render_is_refused(path, tmp_path):
     folder = tmp_path / "f.zarr"
     shutil.copytree(path, folder)
-    content = json.loads((folder / "zarr.json").read_text())
-    content["attributes"]["beatfield"]["fixtures"]["guide"]["delta_mm"] = 0.5
-    (folder / "zarr.json").write_text(json.dumps(content))
-    (folder / "manifest.json").unlink()
-    write_manifest(folder)
+    edit(folder, lambda told: told["fixtures"]["guide"].update(delta_mm=0.5))
 
     with pytest.raises(InputError, match=r"fixture guide: .*stiffer than the touch.* 400 N/m"):
         query_point(folder, (14.0, 2, 1), 0.3)

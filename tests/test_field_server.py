@@ -1,6 +1,5 @@
 """What a force server meets beside good questions: spoilt files, no tracker, endless tools."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -9,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from c_program import HERE, SANITIZE, build, run
-from field_baked import bake_small
+from field_baked import bake_small, edit
 from field_random import EVEN, ORIGIN_MM, write_random
 from scipy.spatial.transform import Rotation
 
 from pipeline.cli import main
 from pipeline.errors import InputError
 from pipeline.field import ForceField, files, get_include
-from pipeline.field.manifest import write_manifest
 from pipeline.field.passivity import EnergyTank
 from pipeline.field.spline import phase_weights, timeline
 from pipeline.field.tool import Needle, Polyline, outside_share
@@ -40,18 +38,17 @@ def program(tmp_path_factory):
 
 def described(path, target, **changes):
     """The store with other words in its description, sealed anew."""
+
+    def change(told):
+        for key, value in changes.items():
+            *parents, last = key.split("__")
+            part = told
+            for name in parents:
+                part = part[name]
+            part[last] = value
+
     shutil.copytree(path, target)
-    content = json.loads((target / "zarr.json").read_text())
-    field = content["attributes"]["beatfield"]
-    for key, value in changes.items():
-        *parents, last = key.split("__")
-        part = field
-        for name in parents:
-            part = part[name]
-        part[last] = value
-    (target / "zarr.json").write_text(json.dumps(content))
-    (target / "manifest.json").unlink()
-    write_manifest(target)
+    edit(target, change)
     return target
 
 

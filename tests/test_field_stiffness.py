@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from field_random import described
 from field_shapes import torus_distance
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from pipeline.field import Fixture, ForceField
 from pipeline.field.certificate import rate_bound_n_per_mm, spline_limits
-from pipeline.field.metadata import FieldMetadata, FixturePart, GridPart, StructurePart
 from pipeline.field.spline import space_coefficients
 from pipeline.field.stiffness import field_rates_n_per_m
 from pipeline.field.store import FieldWriter
@@ -154,18 +154,7 @@ def write_field(path, distance, fixture: Fixture) -> ForceField:
     """A field whose stored distances are those of the closed form."""
     count = int(48 / SPACING_MM) + 1
     grid = Grid((count,) * 3, (-24.0,) * 3, (SPACING_MM,) * 3)
-    about = FieldMetadata(
-        phases=[0.0],
-        rr_s=None,
-        mr_from_tracker=None,
-        grid=GridPart(shape_zyx=grid.shape, origin_mm=grid.origin_mm, spacing_mm=grid.spacing_mm),
-        structures={
-            "s": StructurePart(path="distance/s", spline="spline/s", triangles=[0], volume_ml=[0])
-        },
-        fixtures={"f": FixturePart.of("f", fixture)},
-        source={},
-        accuracy={},
-    )
+    about = described(grid, np.zeros(1), fixture)
     writer = FieldWriter(path, about)
     values_mm = distance(grid.nodes_mm())
     writer.write("distance/s", 0, values_mm.astype(np.float32))

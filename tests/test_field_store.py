@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, bake_small
+from field_baked import FIXTURES, PHASES, RADII_MM, RR_S, bake_small, edit, seal
 from field_random import EVEN, ORIGIN_MM, SPACING_MM, write_random
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pipeline.errors import InputError
 from pipeline.field import ForceField
 from pipeline.field.files import read_metadata
-from pipeline.field.manifest import canonical_manifest, write_manifest
+from pipeline.field.manifest import canonical_manifest
 from pipeline.field.potential import offence, potential
 from pipeline.field.query import query_point
 from pipeline.field.verify import verify_field
@@ -35,15 +35,6 @@ def copy(path, tmp_path):
 
 def files_of(path: Path) -> list[Path]:
     return sorted(one for one in path.rglob("*") if one.is_file())
-
-
-def edit(path: Path, change) -> None:
-    """Change the group's description and seal the store again, as a wrong program would."""
-    description = json.loads((path / "zarr.json").read_text())
-    change(description["attributes"]["beatfield"])
-    (path / "zarr.json").write_text(json.dumps(description))
-    (path / "manifest.json").unlink()
-    write_manifest(path)
 
 
 def test_zarr_python_reads_it(path):
@@ -245,7 +236,7 @@ def test_sealed_values_that_are_no_numbers_are_found(copy, array):
     values = np.fromfile(chunk, dtype="<f4")
     values[100] = np.nan
     values.tofile(chunk)
-    edit(copy, lambda described: None)
+    seal(copy)
 
     with pytest.raises(InputError, match=f"{array}: phase 3"):
         verify_field(copy)
@@ -268,7 +259,7 @@ def rewrite(path: Path, change, arrays=("distance/ball", "spline/ball")) -> None
             after = change(before)
         for chunk, values in zip(chunks, after, strict=True):
             values.astype("<f4").tofile(chunk)
-    edit(path, lambda described: None)
+    seal(path)
 
 
 @pytest.mark.parametrize(
@@ -288,7 +279,7 @@ def test_sealed_values_that_are_no_distances_to_the_surface_are_found(copy, chan
 def test_sealed_arrays_of_another_kind_are_found(copy):
     file = copy / "distance" / "ball" / "zarr.json"
     file.write_text(file.read_text().replace("little", "big"))
-    edit(copy, lambda described: None)
+    seal(copy)
 
     with pytest.raises(InputError, match=r"distance/ball/zarr\.json: codecs"):
         verify_field(copy)
@@ -327,8 +318,7 @@ def test_a_description_that_is_none_is_told_with_its_file(copy, key, value, word
 @pytest.mark.parametrize("text", ["[]", "5", '{"shape": []}', "[" * 100_000])
 def test_an_array_sealed_with_no_description_of_its_own_is_told(copy, text):
     (copy / "distance" / "ball" / "zarr.json").write_text(text)
-    (copy / "manifest.json").unlink()
-    write_manifest(copy)
+    seal(copy)
     with pytest.raises(InputError, match=r"distance/ball/zarr\.json: (is no|shape is|cannot be)"):
         verify_field(copy)
 
@@ -379,7 +369,7 @@ def test_a_sealed_potential_that_is_nearly_the_formula_is_found(copy):
     values = np.fromfile(chunk, dtype="<f4")
     values[np.argmin(np.abs(values - 0.5))] += 1e-6
     values.tofile(chunk)
-    edit(copy, lambda described: None)
+    seal(copy)
     with pytest.raises(InputError, match="guide: phase 2 is not the formula"):
         verify_field(copy)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -137,14 +138,19 @@ def bake_field(
     )
     _require_room(metadata, settings)
     writer = FieldWriter(out, metadata)
-    count = _Count(2 * len(phases), progress)
+    done = itertools.count(1)
+
+    def step() -> None:
+        if progress:
+            progress(next(done), 2 * len(phases))
+
     for index in range(len(phases)):
         for name, values in _arrays(index, chosen, fixtures, grid):
             writer.write(name, index, values)
-        count.step()
+        step()
     writer.solve_splines_in_time()
     metadata = _fit(writer, metadata, chosen, grid, settings.fit_rounds)
-    accuracy = certify(ForceField(out, metadata), chosen, settings.samples, count.step)
+    accuracy = certify(ForceField(out, metadata), chosen, settings.samples, step)
     require_bounds(accuracy, settings.bounds, settings.spacing_mm)
     told = {"doubts": list(doubts_of(accuracy))} if doubts_of else {}
     told_of = {"accuracy": accuracy, "source": metadata.source | told}
@@ -161,7 +167,6 @@ def _fit(
 ) -> FieldMetadata:
     """Bring the splines' zeros to the surfaces; the description with what that changed."""
     phases = np.array(metadata.phases)
-
     structures = {
         name: part.model_copy(
             update={
@@ -173,16 +178,6 @@ def _fit(
         for name, part in metadata.structures.items()
     }
     return metadata.model_copy(update={"structures": structures})
-
-
-class _Count:
-    def __init__(self, total: int, progress: Progress | None) -> None:
-        self._done, self._total, self._progress = 0, total, progress
-
-    def step(self) -> None:
-        self._done += 1
-        if self._progress:
-            self._progress(self._done, self._total)
 
 
 def _arrays(

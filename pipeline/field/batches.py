@@ -97,6 +97,17 @@ def _ahead(addresses, grid, ends, number):  # type: ignore[no-untyped-def]
     return start + np.uintp(low * layer), start + np.uintp(high * layer)
 
 
+@_inner
+def _fetch_some(at, end, lines):  # type: ignore[no-untyped-def]
+    """Fetch so many lines, unless they are too many to be worth it; where the next one starts."""
+    if lines <= np.uintp(_MANY_LINES):
+        stop = min(at + lines * np.uintp(_LINE), end)
+        while at < stop:
+            fetch(at)
+            at += np.uintp(_LINE)
+    return at
+
+
 @_asked
 def answer(addresses, line, grid, ends, notes):  # type: ignore[no-untyped-def]
     """Put distance and gradient in the place of the sorted questions in the notes."""
@@ -105,11 +116,7 @@ def answer(addresses, line, grid, ends, notes):  # type: ignore[no-untyped-def]
         at, end = _ahead(addresses, grid, ends, number)
         each = (end - at) // np.uintp(_LINE) // np.uintp(max(ends[number] - n, 1)) + np.uintp(1)
         while n < ends[number]:
-            if each <= np.uintp(_MANY_LINES):
-                stop = min(at + each * np.uintp(_LINE), end)
-                while at < stop:
-                    fetch(at)
-                    at += np.uintp(_LINE)
+            at = _fetch_some(at, end, each)
             notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3] = _spline_at(
                 addresses, line, grid, notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3]
             )
@@ -124,11 +131,7 @@ def answer_force(law, ends, notes):  # type: ignore[no-untyped-def]
         at, end = _ahead(law[0], law[2], ends, number)
         each = (end - at) // np.uintp(_LINE) // np.uintp(max(ends[number] - n, 1)) + np.uintp(1)
         while n < ends[number]:
-            if each <= np.uintp(_MANY_LINES):
-                stop = min(at + each * np.uintp(_LINE), end)
-                while at < stop:
-                    fetch(at)
-                    at += np.uintp(_LINE)
+            at = _fetch_some(at, end, each)
             notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3] = _felt_at(
                 law, notes[n, 0], notes[n, 1], notes[n, 2], notes[n, 3]
             )

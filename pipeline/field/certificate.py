@@ -279,7 +279,7 @@ def _drift(volume: ForceField, structure: str, moving: BeatingSurface) -> dict[s
         names = ("drift_max_mm", "drift_p99_mm", "motion_unsure_p99_mm", "drift_max_mm_by_phase")
         return dict.fromkeys(names)
     off = []
-    unsure_mm = motion.unsure_mm()[~is_gap(np.diff(volume.phases, append=volume.phases[0] + 1))]
+    unsure_mm = motion.unsure_mm()[~is_gap(volume.phases)]
     for moment in halfway(volume.phases).tolist():
         surface = motion.at(moment)
         middles_mm = surface.vertices_mm[surface.triangles].mean(axis=1)

@@ -208,23 +208,17 @@ def _mhd(field: _Stored, folder: Path) -> None:
                 "rename the folder"
             )
         for index, chunk in enumerate(chunks):
-            header = _mhd_header(field, [], [], chunk)
-            (folder / f"{_name(part)}_{index:03d}.mhd").write_text(
-                header, encoding="utf-8", errors="surrogateescape"
-            )
-        step = field.beat / len(field.times)
-        header = _mhd_header(
-            field, [step], [field.times[0]], "\n".join(["LIST 3", *chunks]), len(chunks)
-        )
-        (folder / f"{_name(part)}.mhd").write_text(
-            header, encoding="utf-8", errors="surrogateescape"
-        )
+            _write_mhd(folder / f"{_name(part)}_{index:03d}.mhd", field, chunk)
+        time = field.times[0], field.beat / len(chunks), len(chunks)
+        _write_mhd(folder / f"{_name(part)}.mhd", field, "\n".join(["LIST 3", *chunks]), time)
 
 
-def _mhd_header(
-    field: _Stored, step: list[float], start: list[float], files: str, *phases: int
-) -> str:
-    axes = 3 + len(phases)
+def _write_mhd(
+    path: Path, field: _Stored, files: str, time: tuple[float, float, int] | None = None
+) -> None:
+    """A header; ``time`` are the first moment, the step and the number of phases of a 4D one."""
+    start, step, count = ([one] for one in time) if time else ([], [], [])
+    axes = 3 + len(count)
     lines = [
         "ObjectType = Image",
         f"NDims = {axes}",
@@ -234,11 +228,12 @@ def _mhd_header(
         f"TransformMatrix = {_numbers(np.eye(axes).ravel())}",
         f"Offset = {_numbers([*field.grid.origin_mm, *start])}",
         f"ElementSpacing = {_numbers([*field.grid.spacing_mm, *step])}",
-        f"DimSize = {' '.join(map(str, (*field.nodes, *phases)))}",
+        f"DimSize = {' '.join(map(str, (*field.nodes, *count)))}",
         "ElementType = MET_FLOAT",
         f"ElementDataFile = {files}",
     ]
-    return "\n".join(lines) + "\n"
+    text = "\n".join(lines) + "\n"
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def _sofa(field: _Stored, folder: Path) -> None:

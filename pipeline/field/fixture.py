@@ -11,12 +11,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Literal, Self
 
-from pydantic import (
-    Field,
-    field_serializer,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, field_serializer, field_validator, model_validator
 
 from pipeline.validation import Section
 
@@ -108,9 +103,8 @@ class Fixture(Section):
     def _known_by_name(cls, given: Any) -> Any:
         if isinstance(given, Device | dict):
             return given
-        for name, device in DEVICES.items():
-            if given == name:
-                return device
+        if isinstance(given, str) and given in DEVICES:
+            return DEVICES[given]
         raise ValueError(
             f"is none of {', '.join(DEVICES)}; describe one of your own, as "
             "{name: mine, force_n: 10, stiffness_n_per_m: 2000}"
@@ -119,9 +113,8 @@ class Fixture(Section):
     @field_validator("device")
     @classmethod
     def _known_as_they_are(cls, device: Device) -> Device:
-        for name, known in DEVICES.items():
-            if device.name == name and device != known:
-                raise ValueError(f"{name} is known, with other limits; take another name")
+        if DEVICES.get(device.name, device) != device:
+            raise ValueError(f"{device.name} is known, with other limits; take another name")
         return device
 
     @field_serializer("device")
@@ -164,13 +157,11 @@ class Fixture(Section):
     def _too_stiff(self, allowed_n_per_m: float) -> str:
         stiffness = self.stiffness_n_per_m
         factor = stiffness / allowed_n_per_m
-        name = "delta_mm" if self.gamma_mm is None else "gamma_mm"
-        given = self.delta_mm if self.gamma_mm is None else self.gamma_mm
-        assert given is not None
         # Rounded up, so that the printed number is itself accepted.
-        smallest = math.ceil(given * factor * 1e3) / 1e3
         smallest_delta = math.ceil(self.resolved_delta_mm * factor * 1e3) / 1e3
-        also = "" if name == "delta_mm" else f", which is {name} = {smallest:g}"
+        also = ""
+        if self.gamma_mm is not None:
+            also = f", which is gamma_mm = {math.ceil(self.gamma_mm * factor * 1e3) / 1e3:g}"
         return (
             f"is stiffer than the {self.device.name} can render: {stiffness:.0f} N/m, at "
             f"most {allowed_n_per_m:g} N/m; the smallest width that would do is delta_mm = "

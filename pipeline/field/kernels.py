@@ -26,7 +26,6 @@ for _formula in (formulas.offence, formulas.potential, formulas.pull, formulas.d
 _pull = formulas.pull
 _direction_scale = formulas.direction_scale
 
-
 AHEAD = 16
 """How many questions ahead of its answer what one asks for is brought into the cache."""
 
@@ -41,13 +40,11 @@ INNER = {**ASKED, "no_cpython_wrapper": True}
 
 _SOURCES = ("potential", "kernels", "batches", "tool_kernels", "../compiled")
 
-
 asked = door(Path(__file__).parent, _SOURCES, **ASKED)
 """Compiles what Python calls."""
 
 inner = door(Path(__file__).parent, _SOURCES, **INNER)
 """Compiles what only compiled code calls."""
-
 
 _FOUR_SINGLE = ir.VectorType(ir.FloatType(), 4)
 _FOUR = ir.VectorType(ir.DoubleType(), 4)
@@ -280,6 +277,8 @@ def sample(addresses, line, grid, points_mm, phases, distance_mm, gradient):  # 
 def sample_force(law, points_mm, phases, force_n):  # type: ignore[no-untyped-def]
     """Force at points into ``(n, 3)``; ``law`` is the first seven arguments of ``force_at``."""
     addresses, line, grid = law[:3]
+    # The loop is that of ``sample``: a function that looks ahead for both takes a third longer,
+    # or more.
     # The cell that was fetched last, and its interval of phases; none yet.
     cx, cy, cz, since, until = math.inf, 0.0, 0.0, 0.0, 0.0
     hx, hy, hz = 0.5 * grid[3], 0.5 * grid[4], 0.5 * grid[5]

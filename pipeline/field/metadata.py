@@ -119,10 +119,9 @@ class FixturePart(Part):
     def _limits_of_the_known(cls, given: Any) -> Any:
         """Stores of version 1 may name a known device without its limits."""
         if isinstance(given, dict) and "device_limits" not in given:
-            for name, device in DEVICES.items():
-                if given.get("device") == name:
-                    limits = device.model_dump(exclude={"name"})
-                    return given | {"device_limits": limits}
+            name = given.get("device")
+            if isinstance(name, str) and name in DEVICES:
+                return given | {"device_limits": DEVICES[name].model_dump(exclude={"name"})}
         return given
 
     def fixture(self) -> Fixture:

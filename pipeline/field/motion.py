@@ -139,7 +139,7 @@ def _led_across_gaps(phases: Float) -> tuple[Float, Float]:
     A spline through places that are a little off swings the wider the longer it is left alone.
     """
     steps, one_by_one = np.diff(phases), np.eye(len(phases) - 1)
-    apart = is_gap(steps)
+    apart = is_gap(phases[:-1])
     rows = np.vstack([one_by_one, one_by_one[:1]])
     at, through = [phases[:1]], [rows[:1]]
     for k, step in enumerate(steps):
@@ -152,17 +152,22 @@ def _led_across_gaps(phases: Float) -> tuple[Float, Float]:
 
 def between(phases: Float, count: int) -> Float:
     """``count`` moments a stored phase, evenly up to the next; the stored phases are among them."""
-    steps = np.diff(phases, append=phases[0] + 1)[:, None] / count
+    steps = _steps(phases)[:, None] / count
     return np.asarray(phases[:, None] + steps * np.arange(count)).ravel()
 
 
-def is_gap(steps: Float) -> Mask:
-    """Which of the steps ``(n,)`` between phases that follow one another are gaps."""
+def is_gap(phases: Float) -> Mask:
+    """Which of the steps from stored phases ``(n,)`` to the next, across the cycle's end too, are
+    gaps."""
+    steps = _steps(phases)
     return np.asarray(steps > GAP * steps.mean())
 
 
 def halfway(phases: Float) -> Float:
     """Moments in the middle between stored phases, the last with the first of the next beat; none
     in a gap."""
-    steps = np.diff(phases, append=phases[0] + 1)
-    return np.asarray((phases + steps / 2)[~is_gap(steps)])
+    return np.asarray((phases + _steps(phases) / 2)[~is_gap(phases)])
+
+
+def _steps(phases: Float) -> Float:
+    return np.diff(phases, append=phases[0] + 1)

@@ -173,21 +173,17 @@ def _closest_middle(work, depth):  # type: ignore[no-untyped-def]
 def _away2(u, v, w, half):  # type: ignore[no-untyped-def]
     """Squared distance from a box, in its axes."""
     zero = np.float32(0)
-    du, dv, dw = (
-        max(abs(u) - half[0], zero),
-        max(abs(v) - half[1], zero),
-        max(abs(w) - half[2], zero),
-    )
+    du, dv = max(abs(u) - half[0], zero), max(abs(v) - half[1], zero)
+    dw = max(abs(w) - half[2], zero)
     return du * du + dv * dv + dw * dw
 
 
 @njit(**UNCOUNTED, forceinline=True, fastmath=FAST)
-def _bounds(lists, depth, count, x, y, z, hx, hy, hz, upper, bound):  # type: ignore[no-untyped-def]
+def _bounds(lists, depth, count, middle, half_block, upper, bound):  # type: ignore[no-untyped-def]
     """For each box: the least, over the corners of a block, of its squared distance less the
-    bound there.
-
-    The block has its middle in (x, y, z) and half its sizes are hx, hy, hz.
-    """
+    bound there."""
+    x, y, z = np.float32(middle[0]), np.float32(middle[1]), np.float32(middle[2])
+    hx, hy, hz = np.float32(half_block[0]), np.float32(half_block[1]), np.float32(half_block[2])
     upper_0, upper_1, upper_2, upper_3 = upper[0], upper[1], upper[2], upper[3]
     upper_4, upper_5, upper_6, upper_7 = upper[4], upper[5], upper[6], upper[7]
     for k in range(count):
@@ -324,19 +320,8 @@ def _select(work, depth):  # type: ignore[no-untyped-def]
     farther than the point; how many."""
     count = work.counts[depth]
     sifted = _sift(work, depth)
-    _bounds(
-        work.lists,
-        SIFTED,
-        -sifted // LANES * -LANES,
-        np.float32(work.middle[0]),
-        np.float32(work.middle[1]),
-        np.float32(work.middle[2]),
-        np.float32(work.half[0]),
-        np.float32(work.half[1]),
-        np.float32(work.half[2]),
-        work.upper,
-        work.bound,
-    )
+    vectors = -sifted // LANES * -LANES
+    _bounds(work.lists, SIFTED, vectors, work.middle, work.half, work.upper, work.bound)
     used = 0
     for k in range(sifted):
         work.kept[used] = work.kept[k]
@@ -377,18 +362,10 @@ def _open(tree, work, source, target, count):  # type: ignore[no-untyped-def]
         group, first = start + kept[k], k * FAN
         for row in range(BOX_ROWS):
             # All eight are read before one is written, so that they travel as a vector.
-            a, b, c, d = (
-                boxes[group, row, 0],
-                boxes[group, row, 1],
-                boxes[group, row, 2],
-                boxes[group, row, 3],
-            )
-            e, f, g, h = (
-                boxes[group, row, 4],
-                boxes[group, row, 5],
-                boxes[group, row, 6],
-                boxes[group, row, 7],
-            )
+            a, b = boxes[group, row, 0], boxes[group, row, 1]
+            c, d = boxes[group, row, 2], boxes[group, row, 3]
+            e, f = boxes[group, row, 4], boxes[group, row, 5]
+            g, h = boxes[group, row, 6], boxes[group, row, 7]
             lists[row, first], lists[row, first + 1] = a, b
             lists[row, first + 2], lists[row, first + 3] = c, d
             lists[row, first + 4], lists[row, first + 5] = e, f

@@ -31,15 +31,15 @@ class FieldWriter:
         self._path = path
         self._metadata = metadata
         self._group = zarr.create_group(path, zarr_format=3, attributes=attributes(metadata))
-        self._arrays = {name: self._create(name, metadata) for name in metadata.arrays}
+        self._arrays = {name: self._create(name) for name in metadata.arrays}
 
-    def _create(self, name: str, metadata: FieldMetadata) -> Any:
+    def _create(self, name: str) -> Any:
         from zarr.codecs import BytesCodec
 
-        shape = metadata.grid.shape_zyx
+        shape = self._metadata.grid.shape_zyx
         return self._group.create_array(
             name,
-            shape=(len(metadata.phases), *shape),
+            shape=(len(self._metadata.phases), *shape),
             chunks=(1, *shape),
             dtype="float32",
             serializer=BytesCodec(endian="little"),
@@ -60,11 +60,8 @@ class FieldWriter:
         A slab of nodes is in memory at a time, all its phases together.
         """
         solver = time_solver(np.array(self._metadata.phases))
-        for part in self._metadata.structures.values():
-            mapped = [
-                np.memmap(chunk_path(self._path / part.spline, index), dtype="<f4", mode="r+")
-                for index in range(len(solver))
-            ]
+        for structure in self._metadata.structures:
+            mapped = [phase.reshape(-1) for phase in self.splines(structure)]
             for start in range(0, len(mapped[0]), SLAB):
                 slab = np.stack([phase[start : start + SLAB] for phase in mapped])
                 solved = solver @ slab.astype(np.float64)

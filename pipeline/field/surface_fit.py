@@ -36,11 +36,7 @@ from pipeline.field.motion import BeatingSurface
 from pipeline.field.spline import node_values, phase_weights, timeline
 from pipeline.field.surface_points import Sheet, Spread, sheets_of
 from pipeline.field.threads import processors
-from pipeline.geometry import (
-    Float,
-    Float32,
-    Grid,
-)
+from pipeline.geometry import Float, Float32, Grid
 
 T = TypeVar("T")
 

@@ -119,7 +119,7 @@ def sheets_of(moving: BeatingSurface, phases: Float, grid: Grid) -> Iterator[She
         return
     spreads = [_spreads(moving.at(0), step_mm, number) for number in range(MOMENTS_A_PHASE)]
     moments = between(phases, MOMENTS_A_PHASE).reshape(-1, MOMENTS_A_PHASE)
-    moments[is_gap(np.diff(phases, append=phases[0] + 1)), 1:] = np.nan
+    moments[is_gap(phases), 1:] = np.nan
     unsure_of_each_mm = np.zeros(motion.places_mm.shape[:2])
     if len(phases) < FEW_PHASES:
         unsure_of_each_mm = motion.unsure_mm()

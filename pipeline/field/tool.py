@@ -66,6 +66,12 @@ class _Tool(Section):
         return Lines(np.ascontiguousarray(np.concatenate(parts)), starts.astype(np.int64))
 
 
+def _ring_mm(radius_mm: float, count: int) -> Float:
+    """Points of a circle about z, evenly spaced."""
+    angles = 2 * math.pi * np.arange(count) / count
+    return radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+
+
 class Needle(_Tool):
     """A straight line from the tip up."""
 
@@ -88,8 +94,7 @@ class Cylinder(_Tool):
         """Lines along the wall, ``(2, 3)`` each."""
         up_mm = np.array([0.0, 0.0, self.length_mm])
         count = max(LEAST_LINES, math.ceil(2 * math.pi * self.radius_mm / LINES_APART_MM))
-        angles = 2 * math.pi * np.arange(count) / count
-        feet = self.radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+        feet = _ring_mm(self.radius_mm, count)
         return [np.stack([foot, foot + up_mm]) for foot in feet]
 
 
@@ -101,10 +106,8 @@ class Torus(_Tool):
 
     def lines_mm(self) -> list[Float]:
         """Its one closed line, the first point repeated."""
-        angles = 2 * math.pi * np.arange(CORNERS + 1) / CORNERS
-        ring = self.radius_mm * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
-        ring[-1] = ring[0]
-        return [ring]
+        ring_mm = _ring_mm(self.radius_mm, CORNERS)
+        return [np.concatenate([ring_mm, ring_mm[:1]])]
 
 
 class Polyline(_Tool):
@@ -209,13 +212,13 @@ def _corners_mm(path: Path) -> Float:
         ) from error
 
 
-def spread_points(corners_mm: Float, count: int, where: str = "a tool's mesh") -> Float:
+def spread_points(corners_mm: Float, count: int, where: str) -> Float:
     """``(count, 3)`` points that cover triangles ``(n, 3, 3)`` evenly, the same ones every time.
 
     Raises
     ------
     InputError
-        When the triangles have no area.
+        When the triangles have no area; it begins with ``where``.
     """
     area = np.linalg.norm(area_vectors(corners_mm), axis=1)
     if not area.sum() > 0:

@@ -58,9 +58,7 @@ class TriangleTree(NamedTuple):
     """Middle of the surface."""
 
 
-def plant(
-    vertices_mm: Float, triangles: Integer, around_mm: Float, threads: int = 1
-) -> TriangleTree:
+def plant(vertices_mm: Float, triangles: Integer, around_mm: Float, threads: int) -> TriangleTree:
     """Build the tree of ``(n, 3)`` vertices and ``(m, 3)`` vertex numbers.
 
     ``around_mm`` are two opposite corners ``(2, 3)`` of the space from which distances will be
