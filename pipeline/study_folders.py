@@ -39,7 +39,8 @@ def found_cine(folder: Path, given: Any) -> Any:
         raise InputError(
             f"{cine}: holds {len(images)} NIfTI files ({images[0].name}, {images[1].name}), one 4D "
             "file is needed: name it under cine.path in study.yaml, or, where each file is one "
-            "phase, join them into one and write timing.json beside it, as docs/study.md shows"
+            "phase, join them into one and write timing.json beside it, as docs/study.md shows; "
+            "where each is one slice, as converters make of a series a slice, give the DICOM files"
         )
     if images and cine.is_dir():
         _require_no_dicom(cine, images[0])

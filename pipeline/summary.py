@@ -89,8 +89,13 @@ def of_timing(ingest: dict[str, Any]) -> list[str]:
 
 
 def _drawn_between(ingest: dict[str, Any]) -> list[tuple[str, str]]:
-    numbers = ", ".join(map(str, ingest.get("interpolated_slices", [])))
-    return [("input", f"slices {numbers} are drawn between their neighbours")] if numbers else []
+    numbers = ingest.get("interpolated_slices", [])
+    if not numbers:
+        return []
+    named = ", ".join(map(str, numbers))
+    if len(numbers) == 1:
+        return [("input", f"slice {named} is drawn between its neighbours")]
+    return [("input", f"slices {named} are drawn between their neighbours")]
 
 
 def _series_left_out(ingest: dict[str, Any]) -> list[tuple[str, str]]:

@@ -181,7 +181,7 @@ def test_what_systems_leave_is_passed_over_and_foreign_files_are_told_at_once(
         (tmp_path / name).write_bytes(content)
     (tmp_path / "ANNOTATED.seq.NRRD").touch()
     with pytest.raises(
-        InputError, match=r"NRRD: is an image, but neither DICOM nor NIfTI.*4D \.nii\.gz"
+        InputError, match=r"NRRD: is an image, but neither DICOM nor .nii.*4D \.nii\.gz"
     ):
         read_dicom_cine(tmp_path)
     (tmp_path / "ANNOTATED.seq.NRRD").unlink()

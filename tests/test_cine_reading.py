@@ -82,7 +82,14 @@ def alter(name: str, value: Any, at: int = 2) -> Change:
     ("change", "words"),
     [
         (lambda data, number, phase: number != 1, "missing slice"),
-        (lambda data, number, phase: (number, phase) != (1, 2), "missing phase: slice 1"),
+        (
+            lambda data, number, phase: (number, phase) != (1, 2),
+            "missing phase: of 5 phases, slice 1.* has 4; ",
+        ),
+        (
+            lambda data, number, phase: number == 0 or phase or number == 3,
+            r"phases, slice 1 \(.*\) has 4, slice 2 \(.*\) has 4; .*fill_gaps",
+        ),
         (alter("Rows", 4), "different matrices"),
         (alter("PixelSpacing", [2.0, 2.0]), "different pixel spacing"),
         (

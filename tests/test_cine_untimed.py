@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +80,7 @@ def test_images_of_neither_time_nor_number_are_refused(tmp_path: Path, number: i
         return True
 
     write_dicom(tmp_path, change)
-    with pytest.raises(InputError, match="has no trigger time"):
+    with pytest.raises(InputError, match=r"has no trigger time.*cine\.rr_ms alone does not do"):
         read_dicom_cine(tmp_path, RR_MS)
 
 
@@ -248,3 +249,53 @@ def test_a_stack_that_was_taken_twice_is_not_one_of_twice_as_many_phases(tmp_pat
         data.save_as(tmp_path / f"other_{k}.dcm")
     with pytest.raises(InputError, match="slices 0 to 3 are given twice: by series 1"):
         read_dicom_cine(tmp_path, RR_MS)
+
+
+@pytest.mark.parametrize("number", [None, 1])
+def test_a_slice_of_two_acquisitions_is_not_one_of_twice_as_many_phases(
+    tmp_path: Path, number: int | None
+) -> None:
+    """Two heartbeats in one; ``number``: the slice that was taken twice, None: all were."""
+
+    def change(data: FileDataset, slice_number: int, phase: int) -> bool:
+        without_times(data, slice_number, phase)
+        data.AcquisitionNumber = 1
+        return True
+
+    write_dicom(tmp_path, change)
+    for again, phase in ALL_FRAMES:
+        if number in (None, again):
+            data = dicom_frame(again, phase)
+            without_times(data, again, phase)
+            data.InstanceNumber += 1000
+            data.AcquisitionNumber = 2
+            data.PixelData = (pixel_value(phase, again) + 1000).tobytes()
+            data.save_as(tmp_path / f"again_{again}_{phase}.dcm")
+    which = "slices 0 to 3 are" if number is None else f"slice {number} is"
+    with pytest.raises(InputError, match=f"{which} given twice.*acquisition 1.*acquisition 2.*out"):
+        read_dicom_cine(tmp_path, RR_MS)
+
+
+@pytest.mark.parametrize("of_phase", [lambda phase: phase, lambda phase: min(phase, 1)])
+def test_acquisitions_that_are_no_beat_each_leave_a_slice_whole(
+    tmp_path: Path, of_phase: Callable[[int], int]
+) -> None:
+    """A number that counts the images, and one that a single image has of its own."""
+
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.AcquisitionNumber = of_phase(phase)
+        return without_times(data, number, phase)
+
+    write_dicom(tmp_path, change)
+    assert_is_the_stack(read_dicom_cine(tmp_path, RR_MS))
+
+
+def test_a_cine_that_is_called_derived_throughout_is_spread(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        data.ImageType = ["DERIVED", "SECONDARY", "M"]
+        return without_times(data, number, phase)
+
+    write_dicom(tmp_path, change)
+    stack = read_dicom_cine(tmp_path, RR_MS)
+    assert_is_the_stack(stack)
+    assert "in the order of their InstanceNumber" in stack.remarks[0]

@@ -184,7 +184,7 @@ def test_what_of_the_folder_is_not_used_is_told_in_one_line() -> None:
         "interpolated_slices": [4],
     }
     assert remarks({"ingest": {"status": "done", "figures": ingest}}) == [
-        ("input", "slices 4 are drawn between their neighbours"),
+        ("input", "slice 4 is drawn between its neighbours"),
         ("left out", "of the cine's folder series 3: scout, and 1 more that the report names"),
     ]
 

@@ -27,8 +27,12 @@ from pipeline.imaging.spacing import MOST_TOLD, fill_gaps, regular_places
 from pipeline.imaging.stack_choice import choose_stack, stacks_beside
 
 EVENLY = (
-    "give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
+    ", or give cine.rr_ms in study.yaml, by which phases are spread evenly in the order of "
     "InstanceNumber where each image has one and none of a slice tells its time"
+)
+NOT_SPREAD = (
+    "; cine.rr_ms alone does not do, for it spreads phases only where the InstanceNumbers of each "
+    "slice tell their order"
 )
 OTHER_RATE = 1.3
 """Times by which a heart may beat faster or slower than its images tell, by another of their
@@ -128,8 +132,9 @@ def stack_frames(
                 "the other's images out"
             )
     chosen, left_out = choose_stack(frames, where)
-    _require_timing(chosen)
-    slices, time_name = _in_time(by_slice(chosen), where)
+    evenly = EVENLY if rr_source is None else NOT_SPREAD
+    _require_timing(chosen, evenly)
+    slices, time_name = _in_time(by_slice(chosen), where, evenly)
     lines = left_out_lines([*left_out, *others], where)
     try:
         _require_complete(slices, where)
@@ -139,7 +144,8 @@ def stack_frames(
         raise InputError("; not taken: ".join([str(error), *lines])) from error
     triggers = np.array([[frame.times_ms[time_name] for frame in one] for one in slices])
     rr_ms = np.array([np.mean([_rr_ms(frame) for frame in one]) for one in slices])
-    phases = common_phases(triggers, rr_ms, where, places.numbers.tolist())
+    said = where if rr_source is None else f"{where}, with cine.rr_ms {rr_ms[0]:g}"
+    phases = common_phases(triggers, rr_ms, said, places.numbers.tolist())
     mr_from_index = placement(slices[0][0], places.step_mm)
     mr_from_index[:3, 3] = places.origin_mm
     intensity, missing = fill_gaps(_intensity(slices), places.numbers)
@@ -206,7 +212,7 @@ def _doubts_of_series(frames: Sequence[Frame]) -> tuple[str, ...]:
     return ()
 
 
-def _require_timing(frames: Sequence[Frame]) -> None:
+def _require_timing(frames: Sequence[Frame], evenly: str) -> None:
     untimed = [frame for frame in frames if not frame.times_ms]
     if untimed and len(untimed) < len(frames):
         raise InputError(
@@ -218,7 +224,7 @@ def _require_timing(frames: Sequence[Frame]) -> None:
     if untimed:
         raise InputError(
             f"{untimed[0].where}: has no trigger time; export the cine with TriggerTime "
-            f"(0018,1060), or {EVENLY}"
+            f"(0018,1060){evenly}"
         )
     for frame in frames:
         _rr_ms(frame)
@@ -234,8 +240,11 @@ def _rr_ms(frame: Frame) -> float:
     return frame.rr_ms
 
 
-def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[Frame]], str]:
-    """Each slice sorted by the first attribute that tells all of its frames apart."""
+def _in_time(
+    slices: Sequence[Sequence[Frame]], where: str, evenly: str
+) -> tuple[list[list[Frame]], str]:
+    """Each slice sorted by the first attribute that tells all of its frames apart; ``evenly`` says
+    what to do where none does."""
     names = _shared_time_names(slices, where)
     for name in names:
         ordered = _sorted_by(slices, name)
@@ -249,7 +258,7 @@ def _in_time(slices: Sequence[Sequence[Frame]], where: str) -> tuple[list[list[F
         if tie := _tie(one, name):
             raise InputError(
                 f"{where}: {tie[0].where} and {tie[1].where} show the same slice at the same "
-                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(one, name, tie)}"
+                f"trigger time {tie[0].times_ms[name]:g} ms; {_remedy(one, name, tie, evenly)}"
             )
     return ordered, name
 
@@ -272,7 +281,7 @@ def _shared_time_names(slices: Sequence[Sequence[Frame]], where: str) -> list[st
     return names
 
 
-def _remedy(one: Sequence[Frame], name: str, tie: tuple[Frame, Frame]) -> str:
+def _remedy(one: Sequence[Frame], name: str, tie: tuple[Frame, Frame], evenly: str) -> str:
     """What to do about frames of a slice of which two have the same time."""
     if len({frame.times_ms[name] for frame in one}) > 1:
         if tie[0].series_uid == tie[1].series_uid:
@@ -282,8 +291,7 @@ def _remedy(one: Sequence[Frame], name: str, tie: tuple[Frame, Frame]) -> str:
             )
         return "keep one series a slice"
     return (
-        "its times do not tell its phases apart: export them with TriggerTime (0018,1060), or "
-        + EVENLY
+        f"its times do not tell its phases apart: export them with TriggerTime (0018,1060){evenly}"
     )
 
 
@@ -393,11 +401,13 @@ def _require_complete(slices: Sequence[Sequence[Frame]], where: str) -> None:
             f"{where}: {len(slices)} slices of {max(counts)} phases; "
             f"at least {MIN_SLICES} slices of {MIN_PHASES} phases are needed"
         )
-    usual = int(np.median(counts))
+    usual = max(counts, key=lambda count: (counts.count(count), count))
     short = [number for number, count in enumerate(counts) if count != usual]
     if short:
+        told = [f"slice {one} ({slices[one][0].where}) has {counts[one]}" for one in short]
+        more = [f"and so on, {len(told) - MOST_TOLD} more"] if len(told) > MOST_TOLD else []
         raise InputError(
-            f"{where}: missing phase: slice {short[0]} ({slices[short[0]][0].where}) has "
-            f"{counts[short[0]]} phases, the others have {usual}; complete or remove the slice, or "
-            "leave out what is mixed in: cine.leave_out_series in study.yaml takes its number"
+            f"{where}: missing phase: of {usual} phases, {', '.join([*told[:MOST_TOLD], *more])}; "
+            "complete or remove such slices, or leave out what is mixed in: cine.leave_out_series "
+            "in study.yaml takes its number, with cine.fill_gaps: true inside the stack"
         )

@@ -282,7 +282,8 @@ def _frame(
         lacking = [name for name, value in {**told, "PixelSpacing": spacing}.items() if not value]
         raise InputError(
             f"{where}: has no {' and no '.join(lacking)}; export the original images, not screen "
-            "captures"
+            "captures, or, if it is none of the cine, leave its series out: cine.leave_out_series "
+            "in study.yaml takes its number"
         )
     try:
         timing = group("CardiacSynchronizationSequence")

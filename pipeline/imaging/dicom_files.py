@@ -61,7 +61,7 @@ def told_from_notes(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     image = next((one for one in others if one.name.lower().endswith(OTHER_IMAGES)), None)
     if image:
         raise InputError(
-            f"{image}: is an image, but neither DICOM nor NIfTI; save the cine as "
+            f"{image}: is an image, but neither DICOM nor .nii or .nii.gz; save the cine as "
             "one 4D .nii.gz, as docs/study.md shows, or give the scanner's own files"
         )
     archive = next((one for one in others if one.name.lower().endswith(ARCHIVES)), None)

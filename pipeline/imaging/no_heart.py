@@ -65,7 +65,8 @@ def require_contrast(cine: Cine) -> None:
     if len(empty):
         raise StageError(
             f"phase {empty[0]}: no heart found: all pixels of all its slices are alike; leave "
-            f"phase {', '.join(map(str, empty))} out of the files, and out of their times"
+            f"phase {', '.join(map(str, empty))} out of the files, and out of their times; those "
+            "that were spread evenly need times of their own then, in NIfTI as timing.json"
         )
     phase, number = np.argwhere(blank)[0]
     spoilt = blank.any(axis=0)

@@ -105,7 +105,8 @@ def _require_even(
             f"{where}: slices are not evenly spaced: {slices[worst][0].where} lies "
             f"{abs(off_mm[worst]):.2f} mm along the normal from its place in an even stack from "
             f"the first to the last, {allowed_mm:.2f} mm are allowed; steps along the normal are "
-            f"{lengths_mm.round(2).tolist()} mm. Keep the slices of one stack"
+            f"{lengths_mm.round(2).tolist()} mm. Keep the slices of one stack: one that was "
+            "planned elsewhere may be left out, with cine.fill_gaps: true inside the stack"
         )
 
 

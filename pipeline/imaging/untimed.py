@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.errors import InputError
 from pipeline.imaging.frames import (
+    DERIVED,
     LEAVE_OUT,
     MIN_PHASES,
     ORIGINAL,
@@ -22,16 +23,16 @@ from pipeline.imaging.frames import (
 ORDER = "InstanceNumber"
 ALIKE_COUNT = 1.25
 """A series across the stack is a cine as the stack is if its slices have as many images, but for
-this factor; perfusion, maps and localisers have more or fewer."""
+this factor; perfusion, maps and localisers have more or fewer. So have two acquisitions."""
 
 
 def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[list[Frame], str]:
     """Images with the times of a regular beat where their own tell none, and a remark on it.
 
-    Each series' images of a slice are spread over the RR interval in the order of their
-    InstanceNumber, which scanners count in the order of time within a slice. So it is with a stack
-    to which none is parallel that has times, and with what lies across it and has about as many
-    images a slice. The remark is empty where there is no such stack.
+    Each series' and acquisition's images of a slice are spread over the RR interval in the order of
+    their InstanceNumber, which scanners count in the order of time within a slice. So it is with a
+    stack to which none is parallel that has times, and with what lies across it and has about as
+    many images a slice. The remark is empty where there is no such stack.
 
     Parameters
     ----------
@@ -44,7 +45,8 @@ def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[li
         When there are two such stacks of one direction: one of them may be many beats in real time.
     """
     frames = list(frames)
-    timed = [one for one in sets_alike(frames) if one[0].kind == ORIGINAL and is_stack(one)]
+    kind = _kind_of_stacks(frames, rr_ms)
+    timed = [one for one in sets_alike(frames) if one[0].kind == kind and is_stack(one)]
     spread: dict[int, Frame] = {}
     stacks: list[list[Frame]] = []
     others: list[list[Frame]] = []
@@ -53,7 +55,7 @@ def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[li
         if any(are_parallel(alike[0], one[0]) for one in timed) or not found:
             continue
         even = [found.get(id(frame), frame) for frame in alike]
-        if alike[0].kind == ORIGINAL and is_stack(even):
+        if alike[0].kind == kind and is_stack(even):
             stacks.append(alike)
             spread |= found
         else:
@@ -75,6 +77,16 @@ def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[li
         f"slice are taken in the order of their InstanceNumber, evenly over the RR interval of "
         f"cine.rr_ms{also}; of a heart seen in real time that would be wrong"
     )
+
+
+def _kind_of_stacks(frames: Sequence[Frame], rr_ms: float) -> str:
+    """Original, or derived where no original images make up a stack: some programs that make files
+    anonymous call all of them so."""
+    for alike in sets_alike(frames):
+        found = _spread(alike, rr_ms)
+        if alike[0].kind == ORIGINAL and is_stack([found.get(id(one), one) for one in alike]):
+            return ORIGINAL
+    return DERIVED
 
 
 def _require_one_a_direction(stacks: Sequence[Sequence[Frame]], where: str) -> None:
@@ -108,15 +120,27 @@ def _spread(alike: Sequence[Frame], rr_ms: float, count: float | None = None) ->
 
 
 def _of_slice_and_series(alike: Sequence[Frame]) -> list[list[Frame]]:
-    """Parts of images alike, of one slice and series each; whole slices where no series shows a
-    slice more than once."""
+    """Parts of images alike, of one slice, series and acquisition each; whole slices where no
+    series shows a slice more than once."""
     slices = by_slice(alike)
     parts: dict[tuple[int, str], list[Frame]] = {}
     for number, one in enumerate(slices):
         for frame in one:
             parts.setdefault((number, frame.series_uid), []).append(frame)
-    single = max(map(len, parts.values())) == 1
-    return slices if single else list(parts.values())
+    if max(map(len, parts.values())) == 1:
+        return slices
+    return [one for part in parts.values() for one in _acquisitions(part)]
+
+
+def _acquisitions(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Images of one slice and series by acquisition, if each shows about as many, and several: a
+    number that counts images tells of no slice that was taken twice."""
+    found: dict[int | None, list[Frame]] = {}
+    for frame in frames:
+        found.setdefault(frame.acquisition, []).append(frame)
+    counts = [len(one) for one in found.values()]
+    twice = min(counts) >= max(MIN_PHASES, max(counts) / ALIKE_COUNT)
+    return list(found.values()) if twice else [list(frames)]
 
 
 def _in_order(frames: Iterable[Frame]) -> list[list[Frame]]:
