@@ -96,11 +96,14 @@ def alter(name: str, value: Any, at: int = 2) -> Change:
             alter("ImageOrientationPatient", [1, 0, 0, 0, 0, -1]),
             "missing slice.*; not taken: .* not parallel",
         ),
-        (alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()), "evenly spaced: "),
+        (
+            alter("ImagePositionPatient", (ORIGIN_MM + 23 * NORMAL).tolist()),
+            "evenly spaced: .*fill_gaps",
+        ),
         (drop("TriggerTime"), "no trigger time; export"),
         (alter("TriggerTime", None), r"no trigger time, as .* do without .*leave_out_series"),
         (drop("NominalInterval"), "no RR interval"),
-        (drop("ImagePositionPatient"), "no ImagePositionPatient"),
+        (drop("ImagePositionPatient"), "no ImagePositionPatient.*leave_out_series"),
         (alter("NominalInterval", 90000), "RR interval 90000 ms"),
         (alter("TriggerTime", 0.0), "same trigger time"),
         (lambda data, number, phase: number == 0, "1 slices of 5 phases"),
@@ -135,6 +138,8 @@ def test_the_users_rr_interval_overrides_the_files(tmp_path: Path) -> None:
     stack = read_dicom_cine(tmp_path, rr_ms=1000)
     np.testing.assert_allclose(stack.cine.phases, 0.8 * np.arange(PHASES) / PHASES)
     assert stack.timing_source == "study.yaml"
+    with pytest.raises(InputError, match=r"with cine\.rr_ms 500: .* do not fit in an RR interval"):
+        read_dicom_cine(tmp_path, rr_ms=500)
 
 
 def test_rescaled_pixels_are_in_the_scanners_units(tmp_path: Path) -> None:

@@ -299,3 +299,16 @@ def test_a_cine_that_is_called_derived_throughout_is_spread(tmp_path: Path) -> N
     stack = read_dicom_cine(tmp_path, RR_MS)
     assert_is_the_stack(stack)
     assert "in the order of their InstanceNumber" in stack.remarks[0]
+
+
+def test_derived_images_beside_a_cine_without_an_order_do_not_stand_for_it(tmp_path: Path) -> None:
+    def change(data: FileDataset, number: int, phase: int) -> bool:
+        without_times(data, number, phase)
+        del data.InstanceNumber
+        return True
+
+    write_dicom(tmp_path, change)
+    for k, data in enumerate(plain(PHASES, ImageType=["DERIVED", "SECONDARY", "M"])):
+        data.save_as(tmp_path / f"other_{k}.dcm")
+    with pytest.raises(InputError, match="has no trigger time"):
+        read_dicom_cine(tmp_path, RR_MS)

@@ -31,8 +31,8 @@ EVENLY = (
     "InstanceNumber where each image has one and none of a slice tells its time"
 )
 NOT_SPREAD = (
-    "; cine.rr_ms alone does not do, for it spreads phases only where the InstanceNumbers of each "
-    "slice tell their order"
+    "; cine.rr_ms alone does not do, for it spreads only images that are original, or derived "
+    "throughout, and whose order within each slice their InstanceNumbers tell"
 )
 OTHER_RATE = 1.3
 """Times by which a heart may beat faster or slower than its images tell, by another of their

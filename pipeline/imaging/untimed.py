@@ -45,7 +45,8 @@ def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[li
         When there are two such stacks of one direction: one of them may be many beats in real time.
     """
     frames = list(frames)
-    kind = _kind_of_stacks(frames, rr_ms)
+    # Some programs that make files anonymous call all images derived.
+    kind = ORIGINAL if any(frame.kind == ORIGINAL for frame in frames) else DERIVED
     timed = [one for one in sets_alike(frames) if one[0].kind == kind and is_stack(one)]
     spread: dict[int, Frame] = {}
     stacks: list[list[Frame]] = []
@@ -77,16 +78,6 @@ def spread_evenly(frames: Sequence[Frame], rr_ms: float, where: str) -> tuple[li
         f"slice are taken in the order of their InstanceNumber, evenly over the RR interval of "
         f"cine.rr_ms{also}; of a heart seen in real time that would be wrong"
     )
-
-
-def _kind_of_stacks(frames: Sequence[Frame], rr_ms: float) -> str:
-    """Original, or derived where no original images make up a stack: some programs that make files
-    anonymous call all of them so."""
-    for alike in sets_alike(frames):
-        found = _spread(alike, rr_ms)
-        if alike[0].kind == ORIGINAL and is_stack([found.get(id(one), one) for one in alike]):
-            return ORIGINAL
-    return DERIVED
 
 
 def _require_one_a_direction(stacks: Sequence[Sequence[Frame]], where: str) -> None:
