@@ -81,6 +81,7 @@ def test_the_same_command_writes_the_same_bytes(field_path, tmp_path):
         (["--only", "figure-9"], "figure-9: no such part; there are figure-2"),
         (["--operators", "1"], "an interval needs at least 2"),
         (["--seed", "-1"], "must be 0 or more"),
+        (["--only", "figure-2", "--study", "nowhere"], "nowhere"),
     ],
 )
 def test_wrong_options_are_refused(field_path, tmp_path, capsys, more, words):

@@ -21,6 +21,7 @@ from pipeline.progress import Progress
 from pipeline.publish import publishing
 from pipeline.report.page import Section, filled
 from pipeline.report.style import own_style
+from pipeline.study import open_study
 
 Make = Callable[[Subject, int, int, Progress], Section]
 
@@ -141,11 +142,15 @@ def write_paper(out: Path, options: PaperOptions, watcher: Watcher) -> Path:
     Raises
     ------
     InputError
-        When the folder holds something else, a name is unknown, or the field is not fit.
+        When the folder holds something else, a name is unknown, the field is not fit, or the study
+        is none.
     """
     _require_ours(out)
     _require_sensible(options)
     subject = open_subject(options.products, options.resolved_study())
+    if subject.study is not None:
+        # Refused before minutes are spent on what comes before it.
+        open_study(subject.study)
     parts, notes = [], []
     for name, experiment in EXPERIMENTS.items():
         if options.only and name not in options.only:
