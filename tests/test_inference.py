@@ -263,6 +263,15 @@ def test_the_network_says_the_same_where_opencv_has_no_classic_engine(monkeypatc
     np.testing.assert_allclose(predict(images), found, atol=1e-3)
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 12, 33, 200])
+def test_slices_are_shared_out_in_parts_that_memory_holds(count):
+    parts = inference._parts(np.arange(count) + 5)
+    assert [one for part in parts for one in part] == list(range(5, 5 + count))
+    sizes = [len(part) for part in parts]
+    assert len(parts) >= min(2, count)
+    assert not count or 1 <= min(sizes) <= max(sizes) <= min(16, min(sizes) + 1)
+
+
 def test_threads_that_ask_at_once_are_answered_as_one_alone_is(monkeypatch):
     monkeypatch.setattr(network, "idle", [])
     images = np.random.default_rng(5).uniform(0, 1, (6, 1, 3, 64, 64)).astype(np.float32)

@@ -9,7 +9,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from pipeline.geometry import Float, Float32, Label
+from pipeline.geometry import Float, Float32, Integer, Label
 from pipeline.imaging.cine import Cine
 from pipeline.imaging.flicker import doubted_planes
 from pipeline.imaging.labels import LABELS, most_probable
@@ -29,6 +29,9 @@ from pipeline.progress import Progress
 
 THICKNESS_MM = 6.0
 """Slices that lie closer are averaged over this, the thickness that the network knows."""
+
+MOST_AT_ONCE = 16
+"""Slices that a thread looks at, at most: what it holds meanwhile is some 100 MB."""
 
 LOOKS = 700
 """Images that the network is shown in a study, about, where some can be shown in several ways."""
@@ -174,22 +177,27 @@ def label_probability(
         phase, chosen = piece
         look(phase, chosen, turns_deg(phase, count))
 
-    def look_again(phase: int) -> None:
-        more = more_turns_deg(phase, count, most_views, phases * len(doubted))
-        look(phase, doubted, more, count)
+    def look_again(piece: tuple[int, Sequence[int]]) -> None:
+        phase, chosen = piece
+        look(phase, chosen, more_turns_deg(phase, count, most_views, phases * len(doubted)), count)
 
-    # In halves, of an odd number of phases as many fall to each of two threads.
-    halves = [half.tolist() for half in np.array_split(np.arange(slices), 2)]
+    parts = _parts(range(slices))
     with side_by_side() as pool:
-        done = pool.map(look_first, product(range(phases), halves))
-        for number, _ in enumerate(done):
-            if progress is not None and number % 2:
-                progress(number // 2 + 1, phases)
+        done = pool.map(look_first, product(range(phases), parts))
+        for number, _ in enumerate(done, start=1):
+            if progress is not None and number % len(parts) == 0:
+                progress(number // len(parts), phases)
         every = doubted_planes(value, view.pixel_mm).reshape(slices, planes).any(axis=1)
-        doubted = np.flatnonzero(every).tolist()
-        if doubted:
-            list(pool.map(look_again, range(phases)))
+        doubted = np.flatnonzero(every)
+        list(pool.map(look_again, product(range(phases), _parts(doubted))))
     return PlaneProbability(value, view, planes)
+
+
+def _parts(slices: Sequence[int] | Integer) -> list[list[int]]:
+    """Slices shared out among threads: in halves, so that of an odd number of phases as much falls
+    to each of two; many in smaller parts, for memory."""
+    count = min(max(2, -(-len(slices) // MOST_AT_ONCE)), len(slices))
+    return [part.tolist() for part in np.array_split(slices, count)] if count else []
 
 
 def count_turns(images: int, most: int) -> int:
